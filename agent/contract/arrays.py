@@ -1,0 +1,71 @@
+"""Read-only float64 arrays as fields of pydantic models: nested lists in files, numpy inside."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator
+
+from agent.contract.files import canonical, digest
+
+Array = NDArray[np.float64]
+
+
+class Model(BaseModel):
+    """Frozen, and strict about keys: an unknown one is refused, never ignored."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True, allow_inf_nan=False
+    )
+
+    def document(self) -> Any:
+        """The model as plain lists, dicts, strings and numbers, under the names used in files."""
+        return self.model_dump(by_alias=True)
+
+    def canonical(self) -> bytes:
+        """Canonical JSON: equal models have equal bytes, float64 bit for bit."""
+        return canonical(self.document())
+
+    def digest(self) -> str:
+        """SHA-256 of the canonical JSON."""
+        return digest(self.document())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self.canonical() == other.canonical()
+
+    def __hash__(self) -> int:
+        return hash(self.canonical())
+
+
+def read_only(values: Array) -> Array:
+    """A contiguous float64 copy that refuses to be written to."""
+    copy = np.array(values, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def _matrix(value: Any) -> Array:
+    """A (rows, columns) array from a list of equally long, non-empty lists of finite numbers."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not (isinstance(value, list) and value and all(isinstance(row, list) and row for row in value)):
+        raise ValueError(f"must be a matrix, a list of rows such as [[1.0, 0.0]], got {str(value)[:60]}")
+    for number, row in enumerate(value, 1):
+        if len(row) != len(value[0]):
+            raise ValueError(f"row {number} has {len(row)} entries where row 1 has {len(value[0])}")
+        for entry in row:
+            if isinstance(entry, bool) or not isinstance(entry, int | float):
+                raise ValueError(f"row {number} holds {entry!r}, which is not a number")
+            if not np.isfinite(entry):
+                raise ValueError(f"row {number} holds {entry}; every entry must be finite")
+    return read_only(np.array(value, dtype=np.float64))
+
+
+Matrix = Annotated[Array, PlainValidator(_matrix), PlainSerializer(lambda array: array.tolist())]
+
+
+def shape_text(array: Array) -> str:
+    """"2 x 3" for an array of shape (2, 3)."""
+    return " x ".join(str(size) for size in array.shape)

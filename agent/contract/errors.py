@@ -1,0 +1,111 @@
+"""Every error that peakmesh raises on purpose, and the exit code each one ends a command with.
+
+PeakmeshError
+├── InputError      2  bad usage or malformed input: a file, a name, a value
+├── Unattainable    1  the question was well put and the answer is no: infeasible, no certificate
+└── RunBroken       3  a run or a recording broke: a time-out, a lost peer, a cut log
+    └── Interrupted 130 or 143: stopped by SIGINT or SIGTERM
+
+A message is one sentence that says what, where, the value, and what would be right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from pydantic import ValidationError
+
+EXIT_GOOD = 0
+EXIT_NO = 1
+EXIT_INPUT = 2
+EXIT_BROKEN = 3
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+
+class PeakmeshError(Exception):
+    """Base of every error that a command turns into one sentence and an exit code."""
+
+    exit_code = EXIT_BROKEN
+
+
+class InputError(PeakmeshError):
+    """Bad usage or malformed input."""
+
+    exit_code = EXIT_INPUT
+
+
+class Unattainable(PeakmeshError):
+    """A well-put question whose answer is no."""
+
+    exit_code = EXIT_NO
+
+
+class RunBroken(PeakmeshError):
+    """A run, or the record of one, that broke."""
+
+    exit_code = EXIT_BROKEN
+
+
+class Interrupted(RunBroken):
+    """Stopped from outside by a signal."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__("interrupted" if signal_number == 2 else "terminated")
+        self.exit_code = 128 + signal_number
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names as a person reads them: "a", "b" and "c"; of more than eight the first seven and the last."""
+    quoted = [f'"{name}"' for name in names]
+    if len(quoted) > 8:
+        quoted = [*quoted[:7], f"... {len(quoted) - 8} more ...", quoted[-1]]
+    return " and ".join([", ".join(quoted[:-1]), quoted[-1]] if len(quoted) > 1 else quoted)
+
+
+def first_fault(error: ValidationError, document: Any) -> str:
+    """The first fault pydantic found, as one sentence that names the place by its name, not its index.
+
+    An unknown key comes first: it is mostly the misspelling of one that is then reported as missing.
+    """
+    faults = error.errors(include_url=False)
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    place = _place(fault["loc"], document)
+    match fault["type"]:
+        case "missing":
+            return f'{place}"{fault["loc"][-1]}" is missing'
+        case "extra_forbidden":
+            absent = [str(f["loc"][-1]) for f in faults if f["type"] == "missing"]
+            hint = f"; {listed(absent)} is missing" if absent else ""
+            return f"{place}this key is not known here{hint}"
+        case "value_error":
+            return f"{place}{fault['ctx']['error']}"
+        case _:
+            return f"{place}{_lower(fault['msg'])}, got {_short(fault['input'])}"
+
+
+def _place(location: tuple[int | str, ...], document: Any) -> str:
+    """'node "2": C: ' for ("node", 1, "C")."""
+    words: list[str] = []
+    here = document
+    for step in location:
+        try:
+            here = here[step]
+        except (KeyError, IndexError, TypeError):
+            continue  # a missing key, or the tag of a union, which is no place in the document
+        if isinstance(step, int):
+            name = here.get("name") if isinstance(here, dict) else None
+            words[-1] += f' "{name}"' if isinstance(name, str) else f" number {step + 1}"
+        else:
+            words.append(str(step))
+    return "".join(f"{word}: " for word in words)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _lower(message: str) -> str:
+    return message[:1].lower() + message[1:]

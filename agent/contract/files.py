@@ -1,0 +1,57 @@
+"""Files are written whole or not at all, and never over another one unless asked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from agent.contract.errors import InputError
+
+
+def canonical(document: Any) -> bytes:
+    """The one JSON text of a document: sorted keys, no spaces, shortest decimals that give back every float."""
+    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def digest(document: Any) -> str:
+    """SHA-256 of the canonical JSON, in hexadecimal."""
+    return hashlib.sha256(canonical(document)).hexdigest()
+
+
+def refuse_overwrite(path: Path, *, force: bool) -> None:
+    """Raise InputError where `path` exists and `force` was not given, or its folder does not exist."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file in it")
+    if path.exists() and not force:
+        raise InputError(f"{path} exists already; give another name, or --force to replace it")
+    if not path.parent.is_dir():
+        raise InputError(f"the folder {path.parent} does not exist; create it first")
+
+
+def write_whole(path: Path, data: bytes, *, force: bool = False) -> None:
+    """Write `data` beside `path`, then rename: a reader sees the old file or the new one, nothing between."""
+    refuse_overwrite(path, force=force)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"{path} could not be written: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def read_bytes(path: Path, *, kind: str) -> bytes:
+    """The file's bytes, or an InputError that says why not. `kind` names what was expected of it."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; a {kind} was expected there") from None
+    except OSError as error:
+        raise InputError(f"{path} could not be read as a {kind}: {error.strerror}") from error

@@ -1,0 +1,169 @@
+"""The gains file: the problem, the gains of eq. (5), and what was proved of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from agent.contract.arrays import Array, Matrix, Model, shape_text
+from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.files import read_bytes, write_whole
+from agent.contract.problem import Problem
+
+FORMAT = "peakmesh-gains"
+VERSION = 1
+
+# gains[mode][i][j]: node i receives from node j; only where a_ij > 0 in that mode
+LinkMatrices = dict[str, dict[str, dict[str, Matrix]]]
+
+
+class Solver(Model):
+    """What the solver said. Not believed: the certificate is computed again without it."""
+
+    name: str
+    version: str
+    status: str
+    iterations: int
+    seconds: float
+
+
+class Certificate(Model):
+    """What is proved: sup_k E ||z_tilde(k)||^2 <= gamma^2 sum_k ||w(k)||^2, from zero initial error.
+
+    The expectation is over modes and losses; one run may exceed it. P is over the reduced error state
+    eta = [x; e_1; ...; e_n], nodes in file order, of length nx (n + 1).
+    """
+
+    gamma: float = Field(gt=0.0)
+    kind: Literal["lyapunov", "exact"]
+    form: Literal["structured", "full"]
+    R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx)
+    Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]
+    P: dict[str, Matrix] | None = None  # full: P[mode]
+    horizon: int | None = None  # of the exact gain
+    lmi_gamma: float | None = None  # where an LMI was solved: its optimum, as the solver gave it
+    exact: tuple[float, float] | None = None  # the gain lies between these
+    floor: float | None = None
+    holds: bool
+    verified: str  # what was verified, and how
+    margins: dict[str, float]  # by how much each inequality holds; all positive where it does
+
+
+class Gains(Model):
+    """Gains K_ij, H_ij of eq. (5) for every mode; the filter step multiplies them by a_ij."""
+
+    format: Literal["peakmesh-gains"] = FORMAT
+    version: Literal[1] = VERSION
+    problem: Problem
+    problem_digest: str
+    method: str
+    K: LinkMatrices  # each (nx, nx)
+    H: LinkMatrices  # each (nx, ny_j)
+    certificate: Certificate
+    solver: Solver
+    seconds: dict[str, float]  # of each phase of the design, and "total"
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a gains.json. Raises InputError for a file that is missing, cut, foreign or edited."""
+        return cls.from_bytes(read_bytes(path, kind="gains file"), source=str(path))
+
+    @classmethod
+    def from_bytes(cls, data: bytes, *, source: str) -> Self:
+        """Gains from the bytes of a gains.json; `source` names them in errors."""
+        try:
+            document = json.loads(data)
+        except ValueError as error:
+            raise InputError(f"{source} is not a gains file: it is not valid JSON: {error}") from None
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise InputError(f'{source} is not a gains file: it does not say "format": "{FORMAT}"')
+        if document.get("version") != VERSION:
+            raise InputError(
+                f"{source} has gains format {document.get('version')!r}; this peakmesh reads {VERSION}: "
+                "design the gains again"
+            )
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            raise InputError(f"{source}: {first_fault(error, document)}") from None
+
+    def save(self, path: Path, *, force: bool = False) -> None:
+        """Write canonical JSON, whole or not at all."""
+        write_whole(path, self.canonical(), force=force)
+
+    def for_node(self, name: str) -> NodeGains:
+        """What node `name` needs to run."""
+        problem = self.problem
+        i = problem.node_index(name)
+        links = {
+            mode: tuple(
+                Link(
+                    sender := problem.node_names[j],
+                    float(problem.topologies[s].adjacency[i, j]),
+                    self.K[mode][name][sender],
+                    self.H[mode][name][sender],
+                )
+                for j in problem.neighbours(s, i)
+            )
+            for s, mode in enumerate(problem.mode_names)
+        }
+        node = problem.nodes[i]
+        return NodeGains(name, node.C, node.arrival_probability, problem.plant.M, links)
+
+    @model_validator(mode="after")
+    def _check_digest(self) -> Self:
+        if self.problem_digest != self.problem.digest():
+            raise ValueError(
+                f"the problem in it has digest {self.problem.digest()[:12]}..., the gains were designed for "
+                f"{self.problem_digest[:12]}...: the problem was edited afterwards; design the gains again"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _check_links(self) -> Self:
+        problem = self.problem
+        for letter, gains in (("K", self.K), ("H", self.H)):
+            _same_names(letter, gains, problem.mode_names, "modes")
+            for s, mode in enumerate(problem.mode_names):
+                _same_names(f'{letter}: mode "{mode}"', gains[mode], problem.node_names, "nodes")
+                for i, receiver in enumerate(problem.node_names):
+                    where = f'{letter}: mode "{mode}": node "{receiver}"'
+                    neighbours = problem.neighbours(s, i)
+                    heard = tuple(problem.node_names[j] for j in neighbours)
+                    _same_names(where, gains[mode][receiver], heard, "nodes that it hears in this mode")
+                    for j, sender in zip(neighbours, heard, strict=True):
+                        columns = problem.nx if letter == "K" else problem.nodes[j].C.shape[0]
+                        gain = gains[mode][receiver][sender]
+                        if gain.shape != (problem.nx, columns):
+                            raise ValueError(
+                                f'{where}: from "{sender}" is {shape_text(gain)}; '
+                                f"it must be {problem.nx} x {columns}"
+                            )
+        return self
+
+
+class Link(NamedTuple):
+    """What node i hears from node j in one mode."""
+
+    sender: str
+    weight: float  # a_ij
+    K: Array  # K_ij, (nx, nx)
+    H: Array  # H_ij, (nx, ny_j)
+
+
+class NodeGains(NamedTuple):
+    """One node's slice of the gains."""
+
+    node: str
+    C: Array  # C_i, (ny_i, nx)
+    arrival_probability: float  # beta_i
+    M: Array  # (nz, nx)
+    links: dict[str, tuple[Link, ...]]  # mode -> what the node hears in it, itself among them
+
+
+def _same_names(where: str, found: dict[str, Any], expected: tuple[str, ...], what: str) -> None:
+    if set(found) != set(expected):
+        raise ValueError(f"{where} has gains for {listed(found) or 'none'}; the {what} are {listed(expected)}")

@@ -1,0 +1,343 @@
+"""The problem file: plant, nodes, topologies, Markov chain, disturbance. Eqs. (1)-(3) of Zhu et al. 2020."""
+
+from __future__ import annotations
+
+import csv
+import re
+import tomllib
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+
+from agent.contract.arrays import Array, Matrix, Model, shape_text
+from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.files import read_bytes
+
+ROW_SUM_TOLERANCE = 1e-9
+
+
+def _legal_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
+        raise ValueError(f'"{name}" is not a legal name: use 1 to 64 letters, digits, "-" and "_"')
+    return name
+
+
+Name = Annotated[str, AfterValidator(_legal_name)]
+Number = Annotated[float, Field(strict=True)]  # neither "0.5" nor true is a number
+
+
+class Plant(Model):
+    """Eq. (1): x(k+1) = A x(k) + B w(k), z(k) = M x(k). A: (nx, nx), B: (nx, nw), M: (nz, nx)."""
+
+    A: Matrix
+    B: Matrix
+    M: Matrix
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        nx = self.A.shape[0]
+        if self.A.shape[1] != nx:
+            raise ValueError(f"A is {shape_text(self.A)}; it must be square")
+        if self.B.shape[0] != nx:
+            raise ValueError(f"B is {shape_text(self.B)}; A is {shape_text(self.A)}, so B needs {nx} rows")
+        if self.M.shape[1] != nx:
+            raise ValueError(f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {nx} columns")
+        radius = float(np.abs(np.linalg.eigvals(self.A)).max())
+        if radius >= 1.0:
+            raise ValueError(
+                f"A is unstable: its spectral radius is {radius:.6g} and must be below 1, "
+                "because a node is not told which measurements are lost"
+            )
+        return self
+
+
+class Node(Model):
+    """Eq. (2): y_i(k) = theta_i(k) C_i x(k) + D_i w(k). C_i: (ny_i, nx), D_i: (ny_i, nw).
+
+    `arrival_probability` is beta_i = P(theta_i(k) = 1) of eq. (3), in (0, 1].
+    """
+
+    name: Name
+    C: Matrix
+    D: Matrix
+    arrival_probability: Number
+
+    @field_validator("arrival_probability")
+    @classmethod
+    def _in_range(cls, value: float) -> float:
+        if not 0.0 < value <= 1.0:
+            raise ValueError(f"{value} is not in (0, 1]; 1 means that no measurement is ever lost")
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.C.shape[0] != self.D.shape[0]:
+            raise ValueError(
+                f"C is {shape_text(self.C)} and D is {shape_text(self.D)}; "
+                "both need one row for each measurement of the node"
+            )
+        return self
+
+
+class Topology(Model):
+    """One mode: adjacency (n, n) with a_ij > 0 where node i hears node j, and a_ii > 0."""
+
+    name: Name
+    adjacency: Matrix
+
+
+class MarkovChain(Model):
+    """The switching of the topology: pi_st = P(r(k+1) = t | r(k) = s); `initial` names r(0)."""
+
+    transition: Matrix
+    initial: str
+
+
+class DampedSine(Model):
+    """w(k) = amplitude exp(-decay k) sin(frequency k), alike in every component."""
+
+    kind: Literal["damped-sine"]
+    amplitude: Number = 1.0
+    decay: Number = Field(ge=0.0)
+    frequency: Number = 1.0
+
+
+class Impulse(Model):
+    """w(k) = amplitude at step `at`, in every component, else 0."""
+
+    kind: Literal["impulse"]
+    amplitude: Number = 1.0
+    at: int = Field(default=0, ge=0, strict=True)
+
+
+class White(Model):
+    """w(k) independent, zero-mean, Gaussian with the given standard deviation, in every component."""
+
+    kind: Literal["white"]
+    deviation: Number = Field(gt=0.0)
+
+
+class Samples(Model):
+    """w(k) is row k of a CSV file (one column for each component, no header), and 0 after its last row."""
+
+    kind: Literal["csv"]
+    file: str
+    values: Matrix
+
+
+class Quiet(Model):
+    """w(k) = 0."""
+
+    kind: Literal["none"] = "none"
+
+
+Disturbance = Annotated[DampedSine | Impulse | White | Samples | Quiet, Field(discriminator="kind")]
+
+
+class Problem(Model):
+    """A plant, the nodes that watch it, the topologies of their network and the chain that switches them."""
+
+    name: Name
+    plant: Plant
+    nodes: tuple[Node, ...] = Field(alias="node", min_length=1)
+    topologies: tuple[Topology, ...] = Field(alias="topology", min_length=1)
+    markov: MarkovChain
+    disturbance: Disturbance = Quiet()
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a problem.toml. Raises InputError: one sentence naming the place, the value, what is right."""
+        data = read_bytes(path, kind="problem file")
+        try:
+            document = tomllib.loads(data.decode())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"{path} is not a problem file: it is not valid TOML: {error}") from None
+        try:
+            _read_csv(document, folder=path.parent)
+            return cls.from_document(document)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def from_document(cls, document: Any) -> Self:
+        """A problem from plain dicts and lists, as they stand in problem.toml or gains.json."""
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            raise InputError(first_fault(error, document)) from None
+
+    # what is there
+    @cached_property
+    def node_names(self) -> tuple[str, ...]:
+        return tuple(node.name for node in self.nodes)
+
+    @cached_property
+    def mode_names(self) -> tuple[str, ...]:
+        return tuple(topology.name for topology in self.topologies)
+
+    @property
+    def n(self) -> int:
+        """Number of nodes."""
+        return len(self.nodes)
+
+    @property
+    def nx(self) -> int:
+        """Number of plant states."""
+        return int(self.plant.A.shape[0])
+
+    @property
+    def nw(self) -> int:
+        """Number of disturbances."""
+        return int(self.plant.B.shape[1])
+
+    @property
+    def nz(self) -> int:
+        """Number of outputs to estimate."""
+        return int(self.plant.M.shape[0])
+
+    @cached_property
+    def beta(self) -> Array:
+        """Arrival probabilities, (n,)."""
+        return np.array([node.arrival_probability for node in self.nodes])
+
+    def node_index(self, name: str) -> int:
+        """Index of a node; InputError names the nodes there are."""
+        if name not in self.node_names:
+            raise InputError(f'node "{name}" does not exist; the problem has nodes {listed(self.node_names)}')
+        return self.node_names.index(name)
+
+    def mode_index(self, name: str) -> int:
+        """Index of a mode; InputError names the modes there are."""
+        if name not in self.mode_names:
+            raise InputError(f'mode "{name}" does not exist; the problem has modes {listed(self.mode_names)}')
+        return self.mode_names.index(name)
+
+    def neighbours(self, s: int, i: int) -> tuple[int, ...]:
+        """N_i of mode s: the nodes that node i hears, itself among them, ascending."""
+        return tuple(int(j) for j in np.flatnonzero(self.topologies[s].adjacency[i] > 0.0))
+
+    def ever_heard(self, i: int) -> tuple[int, ...]:
+        """The nodes that node i hears in some mode, itself among them, ascending."""
+        return tuple(sorted({j for s in range(len(self.topologies)) for j in self.neighbours(s, i)}))
+
+    # what must hold
+    @model_validator(mode="before")
+    @classmethod
+    def _adjacency_from_hears(cls, document: Any) -> Any:
+        if not isinstance(document, dict) or not isinstance(document.get("topology"), list):
+            return document
+        nodes = document.get("node")
+        nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+        topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]
+        return {**document, "topology": topologies}
+
+    @model_validator(mode="after")
+    def _check_nodes(self) -> Self:
+        _refuse_duplicates("node", self.node_names)
+        for node in self.nodes:
+            if node.C.shape[1] != self.nx:
+                raise ValueError(
+                    f'node "{node.name}": C is {shape_text(node.C)}; the plant has {self.nx} states, '
+                    f"so C needs {self.nx} columns"
+                )
+            if node.D.shape[1] != self.nw:
+                raise ValueError(
+                    f'node "{node.name}": D is {shape_text(node.D)}; the plant has {self.nw} disturbances, '
+                    f"so D needs {self.nw} columns"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_topologies(self) -> Self:
+        _refuse_duplicates("topology", self.mode_names)
+        for topology in self.topologies:
+            adjacency, where = topology.adjacency, f'topology "{topology.name}": adjacency'
+            if adjacency.shape != (self.n, self.n):
+                raise ValueError(
+                    f"{where} is {shape_text(adjacency)}; {self.n} nodes need {self.n} x {self.n}"
+                )
+            for i, receiver in enumerate(self.node_names):
+                for j, sender in enumerate(self.node_names):
+                    if adjacency[i, j] < 0.0:
+                        raise ValueError(
+                            f'{where} gives "{receiver}" hearing "{sender}" the weight {adjacency[i, j]}; '
+                            "a weight is 0 or positive"
+                        )
+                if adjacency[i, i] == 0.0:
+                    raise ValueError(f'{where} has 0 for "{receiver}" itself; a node hears itself, a_ii = 1')
+        return self
+
+    @model_validator(mode="after")
+    def _check_markov(self) -> Self:
+        transition, modes = self.markov.transition, self.mode_names
+        if transition.shape != (len(modes), len(modes)):
+            raise ValueError(
+                f"markov: transition is {shape_text(transition)}; "
+                f"{len(modes)} topologies need {len(modes)} x {len(modes)}"
+            )
+        for name, row in zip(modes, transition, strict=True):
+            if (row < 0.0).any() or (row > 1.0).any():
+                wrong = row[(row < 0.0) | (row > 1.0)][0]
+                raise ValueError(
+                    f'markov: transition, row of "{name}", holds {wrong}; a probability lies in [0, 1]'
+                )
+            if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
+                raise ValueError(
+                    f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1'
+                )
+        if self.markov.initial not in modes:
+            raise ValueError(f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}')
+        return self
+
+    @model_validator(mode="after")
+    def _check_disturbance(self) -> Self:
+        if isinstance(self.disturbance, Samples) and self.disturbance.values.shape[1] != self.nw:
+            raise ValueError(
+                f'disturbance: "{self.disturbance.file}" has {self.disturbance.values.shape[1]} columns; '
+                f"the plant has {self.nw} disturbances"
+            )
+        return self
+
+
+def _refuse_duplicates(kind: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f'{kind} "{name}" stands there {names.count(name)} times; names must differ')
+
+
+def _with_adjacency(topology: Any, nodes: list[Any]) -> Any:
+    """A topology that says `hears = { "1" = ["4"] }`, as one that says `adjacency`."""
+    if not isinstance(topology, dict) or "hears" not in topology:
+        return topology
+    where = f'topology "{topology.get("name", "?")}": hears'
+    if "adjacency" in topology:
+        raise ValueError(f"{where} and adjacency are both given; keep one of them")
+    hears = topology["hears"]
+    if not (isinstance(hears, dict) and all(isinstance(heard, list) for heard in hears.values())):
+        raise ValueError(f'{where} must map a node to a list of nodes, such as {{ "1" = ["4"] }}')
+    adjacency = np.eye(len(nodes))
+    for receiver, heard in hears.items():
+        for sender in (receiver, *heard):
+            if sender not in nodes:
+                raise ValueError(f"{where}: node {sender!r} does not exist; the nodes are {listed(nodes)}")
+            adjacency[nodes.index(receiver), nodes.index(sender)] = 1.0
+    return {key: value for key, value in topology.items() if key != "hears"} | {"adjacency": adjacency.tolist()}
+
+
+def _read_csv(document: dict[str, Any], *, folder: Path) -> None:
+    """Put the numbers of `disturbance.file` into the document, so that a problem is whole without the file."""
+    disturbance = document.get("disturbance")
+    if not (isinstance(disturbance, dict) and disturbance.get("kind") == "csv" and "file" in disturbance):
+        return
+    path = folder / str(disturbance["file"])
+    text = read_bytes(path, kind="CSV file of the disturbance").decode(errors="replace")
+    rows: list[list[float]] = []
+    for number, row in enumerate(csv.reader(text.splitlines()), 1):
+        try:
+            rows.append([float(entry) for entry in row])
+        except ValueError:
+            raise InputError(f"disturbance: {path}, row {number} is not all numbers: {row}") from None
+    disturbance["values"] = rows

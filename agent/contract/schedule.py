@@ -1,0 +1,98 @@
+"""What chance decides: modes, losses, disturbance, drawn from counter-based streams.
+
+Every draw is a function of (seed, stream, step) alone: numpy's Philox generator with key (seed, stream) and a
+counter that starts at a multiple of the step. So a live run, a simulation and a replay see the same draws
+whatever their order, and a restarted coordinator goes on with the same chain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.problem import DampedSine, Impulse, Problem, Quiet, Samples, White
+
+MODES, LOSSES, DISTURBANCE = 1, 2, 3  # the streams
+_BLOCK = 256  # steps drawn at once; results do not depend on it
+_WORDS = 4  # 64-bit words that one count of Philox gives
+
+
+class Stream:
+    """`width` independent uniform numbers in [0, 1) for every step."""
+
+    def __init__(self, *, seed: int, stream: int, width: int) -> None:
+        self._key = np.array([seed, stream], dtype=np.uint64)
+        self._width = width
+        self._counts = -(-width // _WORDS)  # of Philox, for one step
+        self._first = -1
+        self._block = np.empty((0, width))
+
+    def uniform(self, first: int, steps: int) -> Array:
+        """Draws of steps first ... first + steps - 1, (steps, width)."""
+        counter = np.array([first * self._counts, 0, 0, 0], dtype=np.uint64)
+        words = np.random.Philox(key=self._key, counter=counter).random_raw(steps * self._counts * _WORDS)
+        words = words.reshape(steps, self._counts * _WORDS)[:, : self._width]
+        return (words >> np.uint64(11)) * 2.0**-53
+
+    def at(self, step: int) -> Array:
+        """Draws of one step, (width,)."""
+        first = step - step % _BLOCK
+        if first != self._first:
+            self._first, self._block = first, self.uniform(first, _BLOCK)
+        return np.asarray(self._block[step - first])
+
+
+def modes(problem: Problem, *, seed: int) -> Iterator[int]:
+    """r(0), r(1), ... as indices: r(0) is the initial mode, then one row of Pi after the other."""
+    stream = Stream(seed=seed, stream=MODES, width=1)
+    cumulative = np.cumsum(problem.markov.transition, axis=1)
+    cumulative /= cumulative[:, -1:]  # a row may miss 1 by rounding
+    s, step = problem.mode_index(problem.markov.initial), 0
+    while True:
+        yield s
+        s = int(np.searchsorted(cumulative[s], stream.at(step)[0], side="right"))
+        step += 1
+
+
+class Losses:
+    """theta_i(k) of eq. (3): independent, 1 with probability beta_i."""
+
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        self._beta = problem.beta
+        self._stream = Stream(seed=seed, stream=LOSSES, width=problem.n)
+
+    def at(self, step: int) -> Array:
+        """1.0 where the plant is in y_i(k), 0.0 where the measurement is lost, (n,)."""
+        return (self._stream.at(step) < self._beta).astype(np.float64)
+
+
+class DisturbanceSource:
+    """w(k), (nw,)."""
+
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        self._disturbance = problem.disturbance
+        self._nw = problem.nw
+        self._stream = Stream(seed=seed, stream=DISTURBANCE, width=2 * problem.nw)
+
+    def at(self, step: int) -> Array:
+        match self._disturbance:
+            case Quiet():
+                return np.zeros(self._nw)
+            case DampedSine(amplitude=amplitude, decay=decay, frequency=frequency):
+                return np.full(self._nw, amplitude * math.exp(-decay * step) * math.sin(frequency * step))
+            case Impulse(amplitude=amplitude, at=at):
+                return np.full(self._nw, amplitude if step == at else 0.0)
+            case Samples(values=values):
+                return values[step].copy() if step < len(values) else np.zeros(self._nw)
+            case White(deviation=deviation):
+                return deviation * normal(self._stream.at(step))
+
+
+def normal(uniform: Array) -> Array:
+    """Standard normal draws from twice as many uniform ones, by Box and Muller; (..., 2 m) -> (..., m)."""
+    half = uniform.shape[-1] // 2
+    radius = np.sqrt(-2.0 * np.log1p(-uniform[..., :half]))
+    return np.asarray(radius * np.cos(2.0 * np.pi * uniform[..., half:]))

@@ -1,0 +1,1 @@
+"""The mathematics of peakmesh, seen centrally: design, verification, replay, pictures."""
