@@ -67,5 +67,5 @@ Matrix = Annotated[Array, PlainValidator(_matrix), PlainSerializer(lambda array:
 
 
 def shape_text(array: Array) -> str:
-    """"2 x 3" for an array of shape (2, 3)."""
+    """ "2 x 3" for an array of shape (2, 3)."""
     return " x ".join(str(size) for size in array.shape)

@@ -166,4 +166,6 @@ class NodeGains(NamedTuple):
 
 def _same_names(where: str, found: dict[str, Any], expected: tuple[str, ...], what: str) -> None:
     if set(found) != set(expected):
-        raise ValueError(f"{where} has gains for {listed(found) or 'none'}; the {what} are {listed(expected)}")
+        raise ValueError(
+            f"{where} has gains for {listed(found) or 'none'}; the {what} are {listed(expected)}"
+        )

@@ -230,7 +230,9 @@ class Problem(Model):
         if not isinstance(document, dict) or not isinstance(document.get("topology"), list):
             return document
         nodes = document.get("node")
-        nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+        nodes = (
+            [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+        )
         topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]
         return {**document, "topology": topologies}
 
@@ -289,7 +291,9 @@ class Problem(Model):
                     f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1'
                 )
         if self.markov.initial not in modes:
-            raise ValueError(f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}')
+            raise ValueError(
+                f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}'
+            )
         return self
 
     @model_validator(mode="after")
@@ -324,7 +328,9 @@ def _with_adjacency(topology: Any, nodes: list[Any]) -> Any:
             if sender not in nodes:
                 raise ValueError(f"{where}: node {sender!r} does not exist; the nodes are {listed(nodes)}")
             adjacency[nodes.index(receiver), nodes.index(sender)] = 1.0
-    return {key: value for key, value in topology.items() if key != "hears"} | {"adjacency": adjacency.tolist()}
+    return {key: value for key, value in topology.items() if key != "hears"} | {
+        "adjacency": adjacency.tolist()
+    }
 
 
 def _read_csv(document: dict[str, Any], *, folder: Path) -> None:
