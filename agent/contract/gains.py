@@ -55,8 +55,8 @@ class Certificate(Model):
 class Gains(Model):
     """Gains K_ij, H_ij of eq. (5) for every mode; the filter step multiplies them by a_ij."""
 
-    format: Literal["peakmesh-gains"] = FORMAT
-    version: Literal[1] = VERSION
+    format: Literal["peakmesh-gains"] = "peakmesh-gains"
+    version: Literal[1] = 1
     problem: Problem
     problem_digest: str
     method: str

@@ -19,8 +19,7 @@ Keys that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<n>
 | ready/<who>            | Ready       | everyone but sensors       | coordinator: it has seen all the others    |
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
-| replay/<who>           | queryable   | publishers                 | recorder: messages it lacks                |
-| status/recorder        | queryable   | recorder                   | coordinator: what it lacks, when stuck     |
+| replay/<who>           | queryable   | publishers                 | recorder: their messages from a number on  |
 
 Every data message carries an attachment: its number among the sender's messages, the sender's clock, the
 sender's name (see `Stamp`). A sensor driver may leave it out.
@@ -29,9 +28,11 @@ sender's name (see `Stamp`). A sensor driver may leave it out.
 from __future__ import annotations
 
 import struct
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from agent.contract.problem import Problem
 
 
 class Message(BaseModel):
@@ -95,28 +96,40 @@ class Event(Message):
 
 
 class Ready(BaseModel):
-    """`who` has seen everybody's token; `gains` is the digest of the gains it runs on, "" where it has none."""
+    """`who` has seen everybody's token; `gains` is the digest of the gains it runs on."""
 
     who: str
     gains: str
 
 
 class Control(BaseModel):
-    """The coordinator's word: "start"; "close": step `steps` - 1 was the last; "stop": end now, because."""
+    """The coordinator's word.
 
-    order: str
+    "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`.
+    `external` names the nodes whose measurements come from a sensor, not from the simulated plant.
+    """
+
+    order: Literal["start", "close", "stop"]
     steps: int
+    seed: int
+    window: int
+    external: list[str]
     reason: str
 
 
 class Acknowledged(BaseModel):
-    """The recorder holds the first `received[who]` messages of everyone, and everything of steps < `steps`.
+    """The recorder's word: it holds the first `received[who]` messages of everyone, and every step < `steps`.
 
-    `closed`: the recording is complete and renamed; publishers may go.
+    `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of
+    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name; everybody may go.
     """
 
     steps: int
+    messages: int
+    missing: int
     received: dict[str, int]
+    reached: dict[str, int]
+    lacking: list[str]
     closed: bool
 
 
@@ -185,3 +198,27 @@ def sensor_who(node: str) -> str:
 
 
 COORDINATOR, PLANT, RECORDER = "coordinator", "plant", "recorder"
+CONTROL, ACKNOWLEDGED = "control", "acknowledged"
+
+
+def participants(problem: Problem) -> list[str]:
+    """Everybody who takes part in a run, but for sensors."""
+    return [COORDINATOR, PLANT, RECORDER, *map(node_who, problem.node_names)]
+
+
+def alive(who: str) -> str:
+    return f"alive/{who}"
+
+
+def ready(who: str) -> str:
+    return f"ready/{who}"
+
+
+def replay(who: str) -> str:
+    return f"replay/{who}"
+
+
+def in_words(who: str) -> str:
+    """`node "3"` for node-3, for people."""
+    kind, _, name = who.partition("-")
+    return f'{kind} "{name}"' if name else f"the {kind}"

@@ -92,15 +92,15 @@ class RecordingWriter:
         )
 
     def flush_when_due(self) -> float:
-        """Flush and sync as often as promised; returns the seconds until the next flush is due."""
+        """Flush and sync as often as promised; returns the seconds until it is due again."""
         now = time.monotonic()
         if now - self._flushed >= FLUSH_SECONDS:
             self._writer.flush()
             self._flushed = now
             if now - self._synced >= SYNC_SECONDS:
                 os.fsync(self._file.fileno())
-                self._synced = time.monotonic()
-        return max(0.0, self._flushed + FLUSH_SECONDS - now)
+                self._synced = now
+        return self._flushed + FLUSH_SECONDS - now
 
     def finish(self, end: dict[str, str]) -> None:
         """Write `end`, the index, and give the file its name."""
@@ -135,8 +135,8 @@ class RecordingWriter:
             schema = self._schemas[model.__name__] = self._writer.register_schema(
                 f"peakmesh.{model.__name__}", "jsonschema", text
             )
-        channel = self._channels[topic] = self._writer.register_channel(topic, "json", schema)
-        return channel
+        self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+        return self._channels[topic]
 
 
 class RecordingReader:

@@ -35,7 +35,7 @@ class Stream:
         counter = np.array([first * self._counts, 0, 0, 0], dtype=np.uint64)
         words = np.random.Philox(key=self._key, counter=counter).random_raw(steps * self._counts * _WORDS)
         words = words.reshape(steps, self._counts * _WORDS)[:, : self._width]
-        return (words >> np.uint64(11)) * 2.0**-53
+        return np.asarray((words >> np.uint64(11)) * 2.0**-53)
 
     def at(self, step: int) -> Array:
         """Draws of one step, (width,)."""

@@ -1,0 +1,317 @@
+"""The runtime's commands: run, and one for each role. Results on stdout, progress and errors on stderr."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
+
+from agent.contract.errors import EXIT_GOOD, EXIT_INTERRUPTED, InputError, PeakmeshError, RunBroken
+
+if TYPE_CHECKING:
+    from agent.bus import Network
+    from agent.contract.gains import Gains
+    from agent.plan import Plan
+
+COMMANDS = ("run", "node", "plant", "coordinator", "recorder")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    parser = argparse.ArgumentParser(prog="peakmesh", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    add_commands(commands)
+    return perform(parser.parse_args(arguments))
+
+
+def perform(options: argparse.Namespace) -> int:
+    """Call the chosen command; an error becomes one sentence on stderr and an exit code."""
+    try:
+        code = options.call(options)
+        sys.stdout.flush()
+        return int(code)
+    except PeakmeshError as error:
+        if options.verbose:
+            traceback.print_exc()
+        print(f"peakmesh: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("peakmesh: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_GOOD
+
+
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the runtime's commands to a parser."""
+    run = _command(commands, "run", run_command, "run every role as a process on this machine")
+    _plan_options(run)
+    _recording_options(run)
+    run.add_argument("--wait", type=_positive, default=30.0, metavar="S", help="how long to wait for everybody (30)")
+    run.add_argument("--json", action="store_true", help="print one JSON object")
+
+    node = _command(commands, "node", node_command, "one sensor node")
+    node.add_argument("--node", required=True, metavar="NAME", help="which node of the problem")
+    _network_options(node)
+
+    _network_options(_command(commands, "plant", plant_command, "the simulated plant"))
+
+    coordinator = _command(commands, "coordinator", coordinator_command, "starts the run and gives out the modes")
+    _plan_options(coordinator)
+    _network_options(coordinator)
+
+    recorder = _command(commands, "recorder", recorder_command, "writes every message to a file")
+    _recording_options(recorder)
+    _network_options(recorder)
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """`peakmesh run GAINS`."""
+    from agent.contract.files import refuse_overwrite
+    from agent.launch import launch
+
+    gains = _load(options.gains)
+    plan = _plan(options, gains)
+    name = f"{gains.problem.name}-{secrets.token_hex(4)}"
+    recording = options.output or _default_recording(name)
+    refuse_overwrite(recording, force=options.force)
+    with _progress(plan.steps, quiet=options.json) as report:
+        summary = launch(
+            options.gains,
+            gains,
+            plan,
+            run=name,
+            recording=recording,
+            force=options.force,
+            wait=options.wait,
+            report=report,
+        )
+    result = {"recording": str(recording), "seed": plan.seed, **summary}
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print(
+            f"{result['steps']} steps of {gains.problem.name} by {gains.problem.n} nodes, seed {plan.seed}: "
+            f"{result['messages']} messages recorded, {result['missing']} missing\n"
+            f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} rounds/s\n"
+            f"recording  {recording}"
+        )
+    return EXIT_GOOD
+
+
+def node_command(options: argparse.Namespace) -> int:
+    """`peakmesh node GAINS --node NAME`."""
+    from agent.contract.messages import node_who
+    from agent.roles import node
+
+    gains = _load(options.gains)
+    gains.problem.node_index(options.node)
+    return _publisher(options, gains, node_who(options.node), lambda bus: node.run(bus, gains, node=options.node))
+
+
+def plant_command(options: argparse.Namespace) -> int:
+    """`peakmesh plant GAINS`."""
+    from agent.contract.messages import PLANT
+    from agent.roles import plant
+
+    gains = _load(options.gains)
+    return _publisher(options, gains, PLANT, lambda bus: plant.run(bus, gains))
+
+
+def coordinator_command(options: argparse.Namespace) -> int:
+    """`peakmesh coordinator GAINS`."""
+    from agent.bus import Bus
+    from agent.contract.messages import COORDINATOR
+    from agent.roles import coordinator
+
+    gains = _load(options.gains)
+    plan = _plan(options, gains)
+    say = _say_to_launcher if options.child else _say_to_person
+    with Bus(_network(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
+        say({"listening": bus.locators()})
+        summary = coordinator.run(bus, gains, plan, report=say)
+    say({"summary": summary._asdict()})
+    return EXIT_GOOD
+
+
+def recorder_command(options: argparse.Namespace) -> int:
+    """`peakmesh recorder GAINS -o FILE`."""
+    from agent.bus import Bus
+    from agent.contract.messages import RECORDER
+    from agent.roles import recorder
+
+    gains = _load(options.gains)
+    run = options.run or gains.problem.name
+    path = options.output or _default_recording(run)
+    with Bus(_network(options), run=run, who=RECORDER) as bus:
+        recorder.run(bus, gains, path=path, force=options.force)
+    print(f"recording  {path}")
+    return EXIT_GOOD
+
+
+def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
+    from agent.bus import Bus
+    from agent.roles.joining import take_part
+
+    with Bus(_network(options), run=options.run or gains.problem.name, who=who) as bus:
+        take_part(bus, lambda: role(bus))
+    return EXIT_GOOD
+
+
+# Options.
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    call: Callable[[argparse.Namespace], int],
+    about: str,
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=about, description=about)
+    parser.set_defaults(call=call)
+    parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, from peakmesh design")
+    parser.add_argument("-v", "--verbose", action="store_true", help="show where an error came from")
+    return parser
+
+
+def _plan_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--steps", type=_count, default=200, metavar="N", help="how many steps (200)")
+    parser.add_argument("--seed", type=_natural, default=0, metavar="N", help="of modes, losses, disturbance (0)")
+    parser.add_argument(
+        "--window", type=_count, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
+    )
+    parser.add_argument(
+        "--deadline", type=_positive, default=10.0, metavar="S", help="a run without progress for so long stops (10)"
+    )
+    parser.add_argument(
+        "--external",
+        action="append",
+        default=[],
+        metavar="NODE",
+        help="the measurements of this node come from a sensor, not from the simulated plant; may be repeated",
+    )
+
+
+def _recording_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="recording (recordings/<run>.mcap)")
+    parser.add_argument("--force", action="store_true", help="replace the recording if it exists")
+
+
+def _network_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--run", metavar="NAME", help="name of the run, the same for everybody (the problem's name)")
+    parser.add_argument(
+        "--listen", default="tcp/127.0.0.1:0", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:0)"
+    )
+    parser.add_argument(
+        "--connect", action="append", default=[], metavar="ADDRESS", help="of the coordinator, tcp/127.0.0.1:7447"
+    )
+    parser.add_argument("--wait", type=_positive, default=60.0, metavar="S", help="how long to wait for others (60)")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value < 2**31:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 on")
+    return value
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 on")
+    return value
+
+
+def _load(path: Path) -> Gains:
+    from agent.contract.gains import Gains
+
+    return Gains.load(path)
+
+
+def _plan(options: argparse.Namespace, gains: Gains) -> Plan:
+    from agent.plan import Plan
+
+    for name in options.external:
+        gains.problem.node_index(name)
+    return Plan(options.steps, options.seed, options.window, options.deadline, tuple(options.external))
+
+
+def _network(options: argparse.Namespace) -> Network:
+    from agent.bus import Network
+
+    connect = tuple(options.connect)
+    if options.child:
+        if options.command != "coordinator":
+            connect = (sys.stdin.readline().strip(),)
+            if connect == ("",):
+                raise RunBroken("the launcher ended before the run had started")
+        threading.Thread(target=_stop_with_launcher, daemon=True).start()
+    elif options.command != "coordinator" and not connect:
+        raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
+    return Network(options.listen, connect, options.wait)
+
+
+def _stop_with_launcher() -> None:
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _default_recording(run: str) -> Path:
+    folder = Path("recordings")
+    folder.mkdir(exist_ok=True)
+    return folder / f"{run}.mcap"
+
+
+# Words of the coordinator.
+def _say_to_launcher(word: dict[str, Any]) -> None:
+    print(json.dumps(word), flush=True)
+
+
+def _say_to_person(word: dict[str, Any]) -> None:
+    match word:
+        case {"listening": addresses}:
+            print(f"listening at {', '.join(addresses)}", file=sys.stderr)
+        case {"started": _}:
+            print("everybody is there: the run starts", file=sys.stderr)
+        case {"summary": summary}:
+            print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
+
+
+@contextmanager
+def _progress(steps: int, *, quiet: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A bar on stderr, where that is a terminal; the function takes the coordinator's words."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda word: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("waiting for everybody", total=steps)
+
+        def show(word: dict[str, Any]) -> None:
+            if "started" in word:
+                bar.update(task, description="steps")
+            elif "complete" in word:
+                bar.update(task, completed=word["complete"])
+
+        yield show

@@ -1,0 +1,75 @@
+"""What a node must have before it may go on: its measurement, the mode, the pairs of those it hears. Pure.
+
+Messages may come in any order and some steps early; they are matched by (step, sender), never by time. What
+belongs to a finished step is dropped.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.gains import NodeGains
+from agent.contract.messages import Estimate, Measurement, Message, Mode
+from agent.filter import Pair
+
+
+class Inbox:
+    """The messages of the present step and of those to come."""
+
+    def __init__(self, gains: NodeGains) -> None:
+        self._hears = {mode: [link.sender for link in links] for mode, links in gains.links.items()}
+        self._ny = gains.C.shape[0]
+        self._step = 0
+        self._measurements: dict[int, Array] = {}
+        self._modes: dict[int, str] = {}
+        self._pairs: defaultdict[int, dict[str, Pair]] = defaultdict(dict)
+
+    def put(self, sender: str, message: Message) -> None:
+        """Take in a message; `sender` is the node that an estimate is from. ValueError where it does not fit."""
+        if message.step < self._step:
+            return
+        match message:
+            case Mode(step=step, mode=mode):
+                if mode not in self._hears:
+                    raise ValueError(f'mode "{mode}" does not exist; the gains have {", ".join(self._hears)}')
+                self._modes[step] = mode
+            case Measurement(step=step, y=y):
+                if len(y) != self._ny:
+                    raise ValueError(f"a measurement of step {step} has {len(y)} numbers; the node has {self._ny}")
+                self._measurements[step] = np.array(y)
+            case Estimate(step=step, x_hat=x_hat, innovation=innovation):
+                self._pairs[step][sender] = Pair(np.array(x_hat), np.array(innovation))
+
+    @property
+    def measurement(self) -> Array | None:
+        """y_i of the present step, None while it is missing."""
+        return self._measurements.get(self._step)
+
+    @property
+    def mode(self) -> str | None:
+        """The mode of the present step, None while it is missing."""
+        return self._modes.get(self._step)
+
+    @property
+    def lacking(self) -> int:
+        """How many messages the present step still waits for, at least."""
+        mode = self._modes.get(self._step)
+        if mode is None:
+            return 1
+        pairs = self._pairs[self._step]
+        return sum(sender not in pairs for sender in self._hears[mode])
+
+    @property
+    def heard(self) -> dict[str, Pair]:
+        """The pairs that the present step's mode asks for; complete where nothing is lacking."""
+        pairs = self._pairs[self._step]
+        return {sender: pairs[sender] for sender in self._hears[self._modes[self._step]]}
+
+    def next_step(self) -> None:
+        """Forget the present step."""
+        for kept in (self._measurements, self._modes, self._pairs):
+            kept.pop(self._step, None)
+        self._step += 1

@@ -1,0 +1,196 @@
+"""Starts every role as a process of its own on this machine, forwards signals, collects exits.
+
+A child reads the coordinator's address from its standard input, a pipe that the launcher holds open: its end
+tells the child that the launcher is gone. Children have sessions of their own, so Ctrl-C reaches the launcher
+alone, which has the coordinator end the run in order.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import IO, Any, NamedTuple
+
+from agent.contract.errors import EXIT_BROKEN, EXIT_INPUT, InputError, Interrupted, RunBroken
+from agent.contract.gains import Gains
+from agent.contract.messages import COORDINATOR, PLANT, RECORDER, in_words, node_who
+from agent.plan import Plan
+
+FAREWELL_SECONDS = 1.0  # after the coordinator has gone, the others have so long before they are killed
+
+
+class Child(NamedTuple):
+    """A role's process; what it says on stderr goes to a file, to be shown where it matters."""
+
+    process: subprocess.Popen[bytes]
+    said: IO[bytes]
+
+    def last_words(self) -> str:
+        """The last line of its stderr."""
+        self.said.seek(0)
+        lines = self.said.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("peakmesh: ") if lines else ""
+
+
+def launch(
+    gains_path: Path,
+    gains: Gains,
+    plan: Plan,
+    *,
+    run: str,
+    recording: Path,
+    force: bool,
+    wait: float,
+    report: Callable[[dict[str, Any]], None],
+) -> dict[str, Any]:
+    """Run everything on this machine; returns the coordinator's summary. `report` gets its words as they come.
+
+    Raises what the run ended with: RunBroken, Interrupted, or InputError. No process is left behind.
+    """
+    began = time.time()
+    common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
+    commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
+    commands |= {node_who(name): ["node", *common, "--node", name] for name in gains.problem.node_names}
+    commands[PLANT] = ["plant", *common]
+    commands[RECORDER] = ["recorder", *common, "--output", str(recording), *(["--force"] if force else [])]
+    with _Crew() as crew:
+        for who, command in commands.items():
+            crew.start(who, command)
+        summary: dict[str, Any] = {}
+        for word in crew.words_of_coordinator():
+            if "listening" in word:
+                crew.tell_address(word["listening"][0])
+            elif "started" in word:
+                crew.started = True
+                summary["start_seconds"] = word["started"] - began
+            elif "summary" in word:
+                summary |= word["summary"]
+            report(word)
+        crew.wait()
+        crew.raise_what_happened()
+    return summary
+
+
+def _plan_options(plan: Plan) -> list[str]:
+    options = ["--steps", plan.steps, "--seed", plan.seed, "--window", plan.window, "--deadline", plan.deadline]
+    for node in plan.external:
+        options += ["--external", node]
+    return [str(option) for option in options]
+
+
+class _Crew:
+    """The processes of one run."""
+
+    def __init__(self) -> None:
+        self.started = False
+        self._children: dict[str, Child] = {}
+        self._signal: int | None = None
+        self._failed: str | None = None  # who ended badly before the run had started
+        self._before = {
+            number: signal.signal(number, handler)
+            for number, handler in (
+                (signal.SIGINT, self._on_signal),
+                (signal.SIGTERM, self._on_signal),
+                (signal.SIGCHLD, self._on_exit),
+            )
+        }
+
+    def start(self, who: str, command: list[str]) -> None:
+        said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the crew
+        process = subprocess.Popen(
+            [sys.executable, "-m", "agent", *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if who == COORDINATOR else subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        )
+        self._children[who] = Child(process, said)
+
+    def words_of_coordinator(self) -> Iterator[dict[str, Any]]:
+        """The lines of the coordinator's stdout, until it ends."""
+        stdout = self._children[COORDINATOR].process.stdout
+        assert stdout is not None
+        for line in stdout:
+            yield json.loads(line)
+
+    def tell_address(self, address: str) -> None:
+        for who, child in self._children.items():
+            if who != COORDINATOR:
+                assert child.process.stdin is not None
+                try:
+                    child.process.stdin.write(f"{address}\n".encode())
+                    child.process.stdin.flush()
+                except BrokenPipeError:  # it has ended already; _on_exit sees to that
+                    continue
+
+    def wait(self) -> None:
+        """Until all have ended; who lingers is killed."""
+        deadline = time.monotonic() + FAREWELL_SECONDS
+        for child in self._children.values():
+            try:
+                child.process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+
+    def raise_what_happened(self) -> None:
+        coordinator = self._children[COORDINATOR]
+        code = coordinator.process.returncode
+        if self._signal is not None:
+            raise Interrupted(self._signal)
+        if self._failed is not None:
+            child = self._children[self._failed]
+            self._raise(child, f"{in_words(self._failed)} ended before the run had started")
+        if code != 0:
+            self._raise(coordinator, "the coordinator ended without a word")
+
+    def _raise(self, child: Child, otherwise: str) -> None:
+        code, words = child.process.returncode, child.last_words()
+        if code < 0:
+            raise RunBroken(f"{otherwise}: killed by {signal.Signals(-code).name}")
+        raise (InputError if code == EXIT_INPUT else RunBroken)(words or otherwise)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._signal = self._signal or number
+        self._end_run(number)
+
+    def _on_exit(self, number: int, frame: FrameType | None) -> None:
+        if self.started or self._failed is not None:
+            return
+        for who, child in self._children.items():
+            if who != COORDINATOR and child.process.poll() not in (None, 0):
+                self._failed = who
+                self._end_run(signal.SIGTERM)
+                return
+
+    def _end_run(self, number: int) -> None:
+        if COORDINATOR in self._children:
+            self._children[COORDINATOR].process.send_signal(number)
+
+    def __enter__(self) -> _Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for child in self._children.values():
+            if child.process.poll() is None:
+                child.process.kill()
+            child.process.wait()
+            for stream in (child.process.stdin, child.process.stdout, child.said):
+                if stream is not None:
+                    _close(stream)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+def _close(stream: IO[bytes]) -> None:
+    try:
+        stream.close()
+    except BrokenPipeError:
+        return

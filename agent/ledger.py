@@ -1,0 +1,66 @@
+"""What the recorder has, and what it lacks. Pure."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+from agent.contract.messages import MODE, PLANT_STATE, Stamp, estimate, measurement
+from agent.contract.problem import Problem
+
+
+class Ledger:
+    """Counts messages by sender, and the steps of which every message is there."""
+
+    def __init__(self, problem: Problem) -> None:
+        names = problem.node_names
+        self._topics = (MODE, PLANT_STATE, *map(measurement, names), *map(estimate, names))
+        self._there: defaultdict[int, set[str]] = defaultdict(set)  # topics of the incomplete steps
+        self._early: defaultdict[str, set[int]] = defaultdict(set)  # numbers that came before their turn
+        self.complete = 0  # every message of the steps below is there
+        self.messages = 0  # taken
+        self.received: dict[str, int] = {}  # of each sender, the messages without a gap
+        self.reached: dict[str, int] = {}  # of each sender, the last step seen
+
+    @property
+    def topics(self) -> int:
+        """How many messages a step has."""
+        return len(self._topics)
+
+    def take(self, topic: str, step: int, stamp: Stamp | None) -> bool:
+        """Enter a message; False where it is there already and must not be recorded again."""
+        if stamp is not None and not self._number(stamp.sender, stamp.number):
+            return False
+        self.messages += 1
+        sender = stamp.sender if stamp is not None else f"sensor of {topic}"
+        self.reached[sender] = max(step, self.reached.get(sender, 0))
+        if step >= self.complete and topic in self._topics:
+            self._there[step].add(topic)
+            while len(self._there.get(self.complete, ())) == len(self._topics):
+                del self._there[self.complete]
+                self.complete += 1
+        return True
+
+    def lacking(self) -> list[str]:
+        """The topics that keep the first incomplete step incomplete, in the order in which they come about."""
+        there = self._there.get(self.complete, set())
+        return [topic for topic in self._topics if topic not in there]
+
+    def gaps(self) -> list[str]:
+        """The senders of whom something is missing before what is there."""
+        return [sender for sender, numbers in self._early.items() if numbers]
+
+    def missing(self, sender: str) -> int:
+        """How many messages of a sender are missing before the last one of theirs that is there."""
+        early = self._early.get(sender)
+        return max(early) - self.received.get(sender, 0) - len(early) + 1 if early else 0
+
+    def _number(self, sender: str, number: int) -> bool:
+        expected, early = self.received.get(sender, 0), self._early[sender]
+        if number < expected or number in early:
+            return False
+        early.add(number)
+        while expected in early:
+            early.remove(expected)
+            expected += 1
+        self.received[sender] = expected
+        return True

@@ -1,0 +1,16 @@
+"""What a coordinator is to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The facts of a run that only the coordinator decides; the others learn them at the start."""
+
+    steps: int
+    seed: int
+    window: int = 32  # steps that modes and measurements may run ahead of what is recorded
+    deadline: float = 10.0  # seconds without progress
+    external: tuple[str, ...] = ()  # nodes whose measurements come from a sensor

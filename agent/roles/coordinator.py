@@ -1,0 +1,170 @@
+"""The coordinator: starts the run, gives out the modes, watches over everybody, ends the run.
+
+Lock-step: mode k goes out once the recorder holds all of step k - window. Neither plant nor chain depends on
+the nodes, so they may run ahead; the numbers never depend on the window. Waiting for the recorder, not for the
+nodes, makes a slow recorder slow the run instead of losing from it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+from agent.bus import Bus, Peer
+from agent.contract.errors import InputError, PeakmeshError, RunBroken
+from agent.contract.gains import Gains
+from agent.contract.messages import (
+    EVENT,
+    MODE,
+    Acknowledged,
+    Control,
+    Event,
+    Mode,
+    in_words,
+    participants,
+    sensor_who,
+)
+from agent.contract.schedule import modes
+from agent.plan import Plan
+
+
+REPORT_SECONDS = 0.1
+
+
+class Summary(NamedTuple):
+    """How a run went."""
+
+    steps: int
+    rounds_per_second: float  # from step 0 to the recorder's acknowledgement of the last step
+    messages: int  # recorded
+    missing: int
+
+
+Word = dict[str, Any]  # what the coordinator reports: {"started": time} or {"complete": steps}
+
+
+class Lost(RunBroken):
+    """A participant that is gone."""
+
+    def __init__(self, who: str) -> None:
+        super().__init__(f"{in_words(who)} was lost: its process ended, or the network to it failed")
+        self.who = who
+
+
+def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -> Summary:
+    """Run the whole of `plan`.
+
+    Raises RunBroken where somebody was lost or a deadline has passed, Interrupted on a signal; in both cases the
+    others have been told, and the recorder has closed the recording.
+    """
+    bus.advertise([MODE, EVENT])
+    conductor = Conductor(bus, gains, plan, report)
+    try:
+        conductor.start()
+        report({"started": time.time()})
+        started = time.monotonic()
+        conductor.give_out_modes()
+        seconds = time.monotonic() - started
+    except PeakmeshError as error:
+        last_word = conductor.stop(str(error))
+        if isinstance(error, Lost) and last_word is not None and error.who in last_word.reached:
+            reached = last_word.reached[error.who]
+            raise RunBroken(f"{error}; the last that is recorded of it is of step {reached}") from None
+        if isinstance(error, Lost):
+            raise RunBroken(f"{error}; {conductor.complete} steps were complete") from None
+        raise
+    last_word = conductor.close()
+    return Summary(plan.steps, plan.steps / seconds, last_word.messages, last_word.missing)
+
+
+class Conductor:
+    """The run, from the coordinator's side."""
+
+    def __init__(self, bus: Bus, gains: Gains, plan: Plan, report: Callable[[Word], None]) -> None:
+        self._bus, self._gains, self._plan, self._report = bus, gains, plan, report
+        self._reported = 0.0
+        self.complete = 0  # steps that the recorder holds
+        self._lacking: list[str] = []
+        self._started = False
+
+    def start(self) -> None:
+        """The barrier, and the order to start."""
+        everybody = participants(self._gains.problem)
+        self._bus.enter()
+        self._bus.meet([*everybody, *map(sensor_who, self._plan.external)])
+        for who, ready in self._bus.gather(everybody).items():
+            if ready.gains != self._gains.digest():
+                raise InputError(
+                    f"{in_words(who)} runs on other gains ({ready.gains[:12]}...) than the coordinator "
+                    f"({self._gains.digest()[:12]}...); give everybody the same gains file"
+                )
+        self._order("start")
+        self._started = True
+        self._announce("start", f"{self._plan.steps} steps, seed {self._plan.seed}")
+
+    def give_out_modes(self) -> None:
+        """One mode for every step, at most a window ahead of what is recorded."""
+        names = self._gains.problem.mode_names
+        chain = modes(self._gains.problem, seed=self._plan.seed)
+        for step in range(self._plan.steps):
+            while step >= self.complete + self._plan.window:
+                self._wait_for_progress()
+            self._bus.publish(MODE, Mode(step=step, mode=names[next(chain)]))
+        while self.complete < self._plan.steps:
+            self._wait_for_progress()
+
+    def close(self) -> Acknowledged:
+        """All is done: the recorder closes the recording, then everybody leaves."""
+        self._announce("end", "all steps are done")
+        self._order("close")
+        last_word = self._bus.wait_for_close(timeout=self._plan.deadline)
+        if last_word is None:
+            raise RunBroken(f"the recorder did not close the recording within {self._plan.deadline:g} s")
+        return last_word
+
+    def stop(self, reason: str) -> Acknowledged | None:
+        """Tell everybody why the run ends here, and wait for the recorder where there is something to close."""
+        if self._started:
+            self._announce("stop", reason)
+        self._order("stop", reason)
+        return self._bus.wait_for_close() if self._started else None
+
+    def _order(self, order: Literal["start", "close", "stop"], reason: str = "") -> None:
+        plan = self._plan
+        self._bus.order(
+            Control(
+                order=order,
+                steps=plan.steps,
+                seed=plan.seed,
+                window=plan.window,
+                external=list(plan.external),
+                reason=reason,
+            )
+        )
+
+    def _announce(self, kind: str, detail: str) -> None:
+        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=self._bus.who, detail=detail))
+
+    def _wait_for_progress(self) -> None:
+        """Until the recorder holds one more step, the deadline passes, or somebody is lost."""
+        deadline = time.monotonic() + self._plan.deadline
+        before, recorder_speaks = self.complete, False
+        while self.complete == before:
+            if time.monotonic() >= deadline:
+                raise RunBroken(self._what_is_late(recorder_speaks))
+            for item in self._bus.receive(timeout=deadline - time.monotonic()):
+                if isinstance(item, Acknowledged):
+                    self.complete, self._lacking = item.steps, item.lacking
+                    recorder_speaks = True
+                elif isinstance(item, Peer) and not item.present:
+                    raise Lost(item.who)
+        if time.monotonic() - self._reported >= REPORT_SECONDS:
+            self._reported = time.monotonic()
+            self._report({"complete": self.complete})
+
+    def _what_is_late(self, recorder_speaks: bool) -> str:
+        if not recorder_speaks:
+            return f"the recorder has acknowledged nothing for {self._plan.deadline:g} s, at step {self.complete}"
+        topics = ", ".join(self._lacking)
+        return f"step {self.complete} lacks {topics} after {self._plan.deadline:g} s"

@@ -1,0 +1,159 @@
+"""The recorder: writes every message to MCAP, says what it holds, and closes the recording before anybody leaves."""
+
+from __future__ import annotations
+
+import platform
+import time
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from agent.bus import Bus, RunClosed, Sample
+from agent.contract.errors import Interrupted, RunBroken, first_fault
+from agent.contract.files import refuse_overwrite
+from agent.contract.gains import Gains
+from agent.contract.messages import (
+    COORDINATOR,
+    EVENT,
+    MODE,
+    PLANT,
+    PLANT_STATE,
+    Acknowledged,
+    Control,
+    estimate,
+    measurement,
+    model_of,
+    node_who,
+)
+from agent.contract.recording import Logged, RecordingWriter
+from agent.ledger import Ledger
+from agent.roles.joining import join
+
+BATCH_SECONDS = 0.005  # how long messages gather before they are written
+IDLE_SECONDS = 0.5  # silence after which it says what it lacks
+
+
+def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
+    """Take part as the recorder until the run is closed; raises RunBroken where it did not end well."""
+    refuse_overwrite(path, force=force)
+    names = gains.problem.node_names
+    bus.subscribe([MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)])
+    start = join(bus, gains)
+    facts = _facts(bus.run, gains, start)
+    with RecordingWriter(path, run=facts, gains=gains, force=force) as writer:
+        recorder = Recorder(bus, gains, writer, window=start.window)
+        try:
+            recorder.record()
+        except RunClosed as closed:
+            stopped = closed.control.order == "stop"
+            recorder.close(status="stopped" if stopped else "finished", reason=closed.control.reason)
+            if stopped:
+                raise RunBroken(closed.control.reason) from None
+        except (RunBroken, Interrupted) as error:
+            recorder.close(status="broken", reason=str(error))
+            raise
+
+
+class Recorder:
+    """The open recording, and the ledger of what is in it."""
+
+    def __init__(self, bus: Bus, gains: Gains, writer: RecordingWriter, *, window: int) -> None:
+        self._bus, self._writer = bus, writer
+        self._publishers = [COORDINATOR, PLANT, *map(node_who, gains.problem.node_names)]
+        self._ledger = Ledger(gains.problem)
+        self._quantum = max(1, window // 4)  # steps between acknowledgements
+        self._acknowledged = 0
+        self._last_write = time.monotonic()
+
+    def record(self) -> None:
+        """Until Bus.receive raises: the run is closed, the coordinator lost, or a signal came."""
+        batch = self._quantum * self._ledger.topics
+        while True:
+            items = self._bus.receive(batch, timeout=BATCH_SECONDS)
+            if not items:
+                self._acknowledge()
+                items = self._bus.receive(1, timeout=min(IDLE_SECONDS, self._writer.flush_when_due()))
+            for item in items:
+                if isinstance(item, Sample):
+                    self._write(item)
+            if self._ledger.complete - self._acknowledged >= self._quantum:
+                self._acknowledge()
+            self._writer.flush_when_due()
+            if time.monotonic() - self._last_write >= IDLE_SECONDS:
+                self._complain()
+
+    def close(self, *, status: str, reason: str) -> None:
+        """Ask everybody for what is missing, end the file, and let everybody go."""
+        for who in self._publishers:
+            self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
+        for sample in self._bus.replayed(self._publishers):
+            self._write(sample)
+        ledger = self._ledger
+        end = {"status": status, "reason": reason, "steps": str(ledger.complete)}
+        for who in sorted(ledger.reached):
+            end[f"received.{who}"] = str(ledger.received.get(who, 0))
+            end[f"reached.{who}"] = str(ledger.reached[who])
+            end[f"missing.{who}"] = str(ledger.missing(who))
+        self._writer.finish(end)
+        self._acknowledge(closed=True)
+
+    def _write(self, sample: Sample) -> None:
+        model = model_of(sample.topic)
+        assert model is not None  # only topics of the table are subscribed to
+        try:
+            step = model.decode(sample.payload).step
+        except ValidationError as error:
+            fault = first_fault(error, {})
+            raise RunBroken(f"a message on {sample.topic} is not a {model.__name__}: {fault}") from None
+        if not self._ledger.take(sample.topic, step, sample.stamp):
+            return
+        number, published = sample.stamp[:2] if sample.stamp is not None else (0, sample.time)
+        self._writer.add(Logged(sample.topic, sample.payload, number, sample.time, published))
+        self._last_write = time.monotonic()
+
+    def _acknowledge(self, *, closed: bool = False) -> None:
+        ledger = self._ledger
+        if closed or ledger.complete > self._acknowledged:
+            self._say(lacking=[], closed=closed)
+
+    def _complain(self) -> None:
+        """Nothing has come for a while: ask for what fell into gaps, and say what is missing."""
+        for who in self._ledger.gaps():
+            self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
+        self._say(lacking=self._ledger.lacking(), closed=False)
+        self._last_write = time.monotonic()
+
+    def _say(self, *, lacking: list[str], closed: bool) -> None:
+        ledger = self._ledger
+        self._acknowledged = ledger.complete
+        self._bus.acknowledge(
+            Acknowledged(
+                steps=ledger.complete,
+                messages=ledger.messages,
+                missing=sum(map(ledger.missing, ledger.reached)),
+                received=ledger.received,
+                reached=ledger.reached,
+                lacking=lacking,
+                closed=closed,
+            )
+        )
+
+
+def _facts(run: str, gains: Gains, start: Control) -> dict[str, str]:
+    """Metadata of the run."""
+    packages = ("peakmesh", "numpy", "eclipse-zenoh", "pydantic", "mcap")
+    return {
+        "run": run,
+        "problem": gains.problem.name,
+        "problem_digest": gains.problem_digest,
+        "gains": gains.digest(),
+        "seed": str(start.seed),
+        "steps": str(start.steps),
+        "window": str(start.window),
+        "external": ",".join(start.external),
+        "started": datetime.now(UTC).isoformat(),
+        "python": platform.python_version(),
+        **{package: version(package) for package in packages},
+    }
