@@ -1,0 +1,128 @@
+"""Proofs 3 and 5 of a replay: the model running freely from step 0, and the path inequality."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from designer.replay_log import Log
+from designer.replay_proofs import FLOOR, Central, Check, Drawn, Inputs, numbers
+
+
+class FreeBlock(NamedTuple):
+    """The free run at the steps `first`, `first` + 1, ..."""
+
+    first: int
+    eta: Array  # (steps, n_eta): eta(k) from eta(0) = 0 by (10)
+    reach: (
+        Array  # (steps, n_eta): a relative rounding error of t in every step so far moves eta by t reach at most
+    )
+    path: Array  # (steps,): gamma_path(k), nan where it overflowed
+
+
+def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs:
+    """Inputs without holes: what is not logged comes from the seed's draws, or from what the node made of it."""
+    mode = np.where(
+        (inputs.mode >= 0) & (inputs.mode < len(log.gains.problem.topologies)), inputs.mode, drawn.mode
+    )
+    if log.has_plant:
+        theta = np.where(np.isnan(inputs.theta), drawn.theta, inputs.theta)
+        return Inputs(mode, theta, np.where(np.isnan(inputs.w), drawn.w, inputs.w), inputs.u)
+    y = log.innovation + log.x_hat @ central.bar.C_beta.T
+    return inputs._replace(mode=mode, u=np.where(np.isnan(inputs.u), y, inputs.u))
+
+
+def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Iterator[FreeBlock]:
+    """eta(k+1) = script A_k eta(k) + script B_k w(k) from eta(0) = 0, with two covariances beside it.
+
+    Path gain (theory of the realised run): X(k+1) = A_k X(k) A_k' + B_k B_k' from X(0) = 0 gives
+    gamma_path(k)^2 = lambda_max(M X(k) M').
+
+    Rounding: where each step errs by d_j with |d_j| <= t m_j entry by entry, the free run is off by
+    sum_j Phi(k, j+1) d_j after k steps. With Y(k+1) = A_k Y(k) A_k' + diag(m_k)^2 the inequality of Cauchy and
+    Schwarz bounds entry i of it by t sqrt(k n_eta Y_ii(k)) = t reach_i(k).
+    """
+    model, nx, size = central.model, central.problem.nx, central.model.A.shape[1]
+
+    @lru_cache(maxsize=64)
+    def transition(s: int, theta: bytes) -> Array:
+        A_k = model.A[s].copy()
+        A_k[nx:, :nx] += np.tensordot(np.frombuffer(theta) - model.beta, model.F[s], axes=1)
+        return np.asarray(A_k)
+
+    noise = [B_s @ B_s.T for B_s in model.B]
+    eta, covariances, diagonal = np.zeros(size), np.zeros((2, size, size)), np.arange(size)
+    for first in range(0, log.steps, block):
+        steps = range(first, min(first + block, log.steps))
+        s_of, A_of = inputs.mode[first : steps.stop].tolist(), []
+        etas, reach = np.empty((len(steps), size)), np.empty((len(steps), size))
+        for row, k in enumerate(steps):
+            etas[row] = eta
+            A_k = transition(s_of[row], inputs.theta[k].tobytes())
+            A_of.append(A_k)
+            eta = A_k @ eta + model.B[s_of[row]] @ inputs.w[k]
+            eta[nx:] -= central.H_bar[s_of[row]] @ inputs.u[k]
+        squares = _magnitudes(log, central, inputs, etas, first) ** 2
+        outputs = np.empty((len(steps), len(model.M), len(model.M)))
+        for row, A_k in enumerate(A_of):
+            outputs[row] = model.M @ covariances[0] @ model.M.T
+            reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
+            covariances = A_k @ covariances @ A_k.T
+            covariances[0] += noise[s_of[row]]
+            covariances[1, diagonal, diagonal] += squares[row]
+        yield FreeBlock(first, etas, np.sqrt(np.maximum(reach, FLOOR**2)), _largest(outputs))
+
+
+def free_check(log: Log, central: Central, block: FreeBlock, eta: Array) -> Check:
+    """Proof 3: the free run stays with the log; shown as x_hat(k) = x(k) - e(k). `eta` is the logged one."""
+    nx, steps = central.problem.nx, slice(block.first, block.first + len(block.eta))
+    x = eta[steps, :nx]
+    return numbers(
+        3,
+        "x_hat",
+        block.first,
+        central.owner(nx),
+        log.x_hat[steps],
+        np.tile(x, central.problem.n) - block.eta[:, nx:],
+        block.reach[:, nx:],
+    )
+
+
+class Path(NamedTuple):
+    """Proof 5 over one block: |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2."""
+
+    error: Array  # (steps,): |z_tilde(k)|, as logged; nan where a message is missing
+    bound: Array  # (steps,): gamma_path(k) sqrt(energy of the steps before)
+    rounding: Array  # (steps,): a relative rounding error of t in every step moves the error by t times this
+
+
+def path_block(log: Log, central: Central, block: FreeBlock, energy_before: Array) -> Path:
+    """`energy_before` (all steps) is the sum over j < k of |w(j)|^2."""
+    steps = slice(block.first, block.first + len(block.eta))
+    z_tilde = np.tile(log.z[steps], central.problem.n) - log.z_hat[steps]
+    rounding = np.linalg.norm(block.reach @ np.abs(central.model.M).T, axis=1)
+    return Path(np.linalg.norm(z_tilde, axis=1), block.path * np.sqrt(energy_before[steps]), rounding)
+
+
+def _magnitudes(log: Log, central: Central, inputs: Inputs, eta: Array, first: int) -> Array:
+    """m_k of `free_run` for one block, from the log, and from the free run where the log has holes."""
+    nx, steps = central.problem.nx, slice(first, first + len(eta))
+    x = eta[:, :nx]
+    x_hat = np.where(np.isnan(log.x_hat[steps]), np.tile(x, central.problem.n) - eta[:, nx:], log.x_hat[steps])
+    magnitude = np.empty_like(eta)
+    for s in np.unique(inputs.mode[steps]):
+        at = inputs.mode[steps] == s
+        magnitude[at] = central.magnitude(int(s), x[at], x_hat[at], inputs.w[steps][at], log.y[steps][at])
+    return magnitude
+
+
+def _largest(matrices: Array) -> Array:
+    """Square root of the largest eigenvalue of each symmetric matrix, nan where it is not finite."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    largest = np.full(len(matrices), np.nan)
+    largest[finite] = np.sqrt(np.maximum(np.linalg.eigvalsh(matrices[finite])[:, -1], 0.0))
+    return largest
