@@ -9,12 +9,11 @@ import secrets
 import signal
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
 
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.plan import Plan
 
-COMMANDS = ("run", "node", "plant", "coordinator", "recorder")
+Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # what add_subparsers returns
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,61 +54,65 @@ def perform(options: argparse.Namespace) -> int:
         return EXIT_GOOD
 
 
-def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_commands(commands: Subcommands) -> None:
     """Add the runtime's commands to a parser."""
-    run = _command(commands, "run", run_command, "run every role as a process on this machine")
-    _plan_options(run)
-    _recording_options(run)
-    run.add_argument("--wait", type=_positive, default=30.0, metavar="S", help="how long to wait for everybody (30)")
-    run.add_argument("--json", action="store_true", help="print one JSON object")
+    run = add_command(commands, "run", run_command, "run every role as a process on this machine")
+    run.add_argument("gains", type=Path, metavar="GAINS", help="gains file, from peakmesh design")
+    add_run_options(run)
+    add_roles(commands)
 
-    node = _command(commands, "node", node_command, "one sensor node")
+
+def add_roles(commands: Subcommands) -> None:
+    """Add the commands that take one role each."""
+    node = _role(commands, "node", node_command, "take part as one sensor node")
     node.add_argument("--node", required=True, metavar="NAME", help="which node of the problem")
-    _network_options(node)
-
-    _network_options(_command(commands, "plant", plant_command, "the simulated plant"))
-
-    coordinator = _command(commands, "coordinator", coordinator_command, "starts the run and gives out the modes")
+    _role(commands, "plant", plant_command, "take part as the simulated plant")
+    coordinator = _role(commands, "coordinator", coordinator_command, "start the run, give out the modes, end it")
     _plan_options(coordinator)
-    _network_options(coordinator)
-
-    recorder = _command(commands, "recorder", recorder_command, "writes every message to a file")
+    recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
     _recording_options(recorder)
-    _network_options(recorder)
+
+
+def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `run`, but for what to run."""
+    _plan_options(parser)
+    _recording_options(parser)
+    parser.add_argument("--wait", type=_positive, default=30.0, metavar="S", help="how long to wait for all (30)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def run_command(options: argparse.Namespace) -> int:
     """`peakmesh run GAINS`."""
+    gains = load_gains(options.gains)
+    result = run_gains(options.gains, gains, options)
+    print(json.dumps(result) if options.json else run_text(result))
+    return EXIT_GOOD
+
+
+def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str, Any]:
+    """Run the gains in `path` on this machine; returns the facts of the run."""
     from agent.contract.files import refuse_overwrite
     from agent.launch import launch
 
-    gains = _load(options.gains)
     plan = _plan(options, gains)
-    name = f"{gains.problem.name}-{secrets.token_hex(4)}"
-    recording = options.output or _default_recording(name)
+    run = f"{gains.problem.name}-{secrets.token_hex(4)}"
+    recording = options.output or default_recording(run)
     refuse_overwrite(recording, force=options.force)
-    with _progress(plan.steps, quiet=options.json) as report:
+    with _progress(plan.steps) as report:
         summary = launch(
-            options.gains,
-            gains,
-            plan,
-            run=name,
-            recording=recording,
-            force=options.force,
-            wait=options.wait,
-            report=report,
+            path, gains, plan, run=run, recording=recording, force=options.force, wait=options.wait, report=report
         )
-    result = {"recording": str(recording), "seed": plan.seed, **summary}
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(
-            f"{result['steps']} steps of {gains.problem.name} by {gains.problem.n} nodes, seed {plan.seed}: "
-            f"{result['messages']} messages recorded, {result['missing']} missing\n"
-            f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} rounds/s\n"
-            f"recording  {recording}"
-        )
-    return EXIT_GOOD
+    return {"recording": str(recording), "run": run, "seed": plan.seed, **summary}
+
+
+def run_text(result: dict[str, Any]) -> str:
+    """The facts of a run, for people."""
+    return (
+        f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
+        f"{result['missing']} missing\n"
+        f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s\n"
+        f"recording  {result['recording']}"
+    )
 
 
 def node_command(options: argparse.Namespace) -> int:
@@ -117,7 +120,7 @@ def node_command(options: argparse.Namespace) -> int:
     from agent.contract.messages import node_who
     from agent.roles import node
 
-    gains = _load(options.gains)
+    gains = load_gains(options.gains)
     gains.problem.node_index(options.node)
     return _publisher(options, gains, node_who(options.node), lambda bus: node.run(bus, gains, node=options.node))
 
@@ -127,7 +130,7 @@ def plant_command(options: argparse.Namespace) -> int:
     from agent.contract.messages import PLANT
     from agent.roles import plant
 
-    gains = _load(options.gains)
+    gains = load_gains(options.gains)
     return _publisher(options, gains, PLANT, lambda bus: plant.run(bus, gains))
 
 
@@ -137,7 +140,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
     from agent.contract.messages import COORDINATOR
     from agent.roles import coordinator
 
-    gains = _load(options.gains)
+    gains = load_gains(options.gains)
     plan = _plan(options, gains)
     say = _say_to_launcher if options.child else _say_to_person
     with Bus(_network(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
@@ -153,9 +156,9 @@ def recorder_command(options: argparse.Namespace) -> int:
     from agent.contract.messages import RECORDER
     from agent.roles import recorder
 
-    gains = _load(options.gains)
+    gains = load_gains(options.gains)
     run = options.run or gains.problem.name
-    path = options.output or _default_recording(run)
+    path = options.output or default_recording(run)
     with Bus(_network(options), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force)
     print(f"recording  {path}")
@@ -172,16 +175,22 @@ def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callab
 
 
 # Options.
-def _command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    call: Callable[[argparse.Namespace], int],
-    about: str,
+def add_command(
+    commands: Subcommands, name: str, call: Callable[[argparse.Namespace], int], about: str
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=about, description=about)
+    """Add a command that `perform` will call."""
+    parser = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
     parser.set_defaults(call=call)
-    parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, from peakmesh design")
     parser.add_argument("-v", "--verbose", action="store_true", help="show where an error came from")
+    return parser
+
+
+def _role(
+    commands: Subcommands, name: str, call: Callable[[argparse.Namespace], int], about: str
+) -> argparse.ArgumentParser:
+    parser = add_command(commands, name, call, about)
+    parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, the same for everybody")
+    _network_options(parser)
     return parser
 
 
@@ -241,7 +250,8 @@ def _natural(text: str) -> int:
     return value
 
 
-def _load(path: Path) -> Gains:
+def load_gains(path: Path) -> Gains:
+    """Read a gains file, importing what that needs only now."""
     from agent.contract.gains import Gains
 
     return Gains.load(path)
@@ -271,11 +281,13 @@ def _network(options: argparse.Namespace) -> Network:
 
 
 def _stop_with_launcher() -> None:
-    sys.stdin.read()
+    while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read: its lock would outlive us at exit
+        pass
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _default_recording(run: str) -> Path:
+def default_recording(run: str) -> Path:
+    """recordings/<run>.mcap, in the current folder."""
     folder = Path("recordings")
     folder.mkdir(exist_ok=True)
     return folder / f"{run}.mcap"
@@ -297,9 +309,9 @@ def _say_to_person(word: dict[str, Any]) -> None:
 
 
 @contextmanager
-def _progress(steps: int, *, quiet: bool) -> Iterator[Callable[[dict[str, Any]], None]]:
+def _progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar on stderr, where that is a terminal; the function takes the coordinator's words."""
-    if quiet or not sys.stderr.isatty():
+    if not sys.stderr.isatty():
         yield lambda word: None
         return
     from rich.console import Console

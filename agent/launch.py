@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
 
-from agent.contract.errors import EXIT_BROKEN, EXIT_INPUT, InputError, Interrupted, RunBroken
+from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import COORDINATOR, PLANT, RECORDER, in_words, node_who
 from agent.plan import Plan
@@ -162,7 +162,7 @@ class _Crew:
         self._end_run(number)
 
     def _on_exit(self, number: int, frame: FrameType | None) -> None:
-        if self.started or self._failed is not None:
+        if self.started or self._failed is not None or self._children[COORDINATOR].process.poll() is not None:
             return
         for who, child in self._children.items():
             if who != COORDINATOR and child.process.poll() not in (None, 0):

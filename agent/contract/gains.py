@@ -139,8 +139,7 @@ class Gains(Model):
                         gain = gains[mode][receiver][sender]
                         if gain.shape != (problem.nx, columns):
                             raise ValueError(
-                                f'{where}: from "{sender}" is {shape_text(gain)}; '
-                                f"it must be {problem.nx} x {columns}"
+                                f'{where}: from "{sender}" is {shape_text(gain)}; it must be {problem.nx} x {columns}'
                             )
         return self
 
@@ -166,6 +165,4 @@ class NodeGains(NamedTuple):
 
 def _same_names(where: str, found: dict[str, Any], expected: tuple[str, ...], what: str) -> None:
     if set(found) != set(expected):
-        raise ValueError(
-            f"{where} has gains for {listed(found) or 'none'}; the {what} are {listed(expected)}"
-        )
+        raise ValueError(f"{where} has gains for {listed(found) or 'none'}; the {what} are {listed(expected)}")

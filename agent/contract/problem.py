@@ -230,9 +230,7 @@ class Problem(Model):
         if not isinstance(document, dict) or not isinstance(document.get("topology"), list):
             return document
         nodes = document.get("node")
-        nodes = (
-            [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
-        )
+        nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
         topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]
         return {**document, "topology": topologies}
 
@@ -258,9 +256,7 @@ class Problem(Model):
         for topology in self.topologies:
             adjacency, where = topology.adjacency, f'topology "{topology.name}": adjacency'
             if adjacency.shape != (self.n, self.n):
-                raise ValueError(
-                    f"{where} is {shape_text(adjacency)}; {self.n} nodes need {self.n} x {self.n}"
-                )
+                raise ValueError(f"{where} is {shape_text(adjacency)}; {self.n} nodes need {self.n} x {self.n}")
             for i, receiver in enumerate(self.node_names):
                 for j, sender in enumerate(self.node_names):
                     if adjacency[i, j] < 0.0:
@@ -283,17 +279,11 @@ class Problem(Model):
         for name, row in zip(modes, transition, strict=True):
             if (row < 0.0).any() or (row > 1.0).any():
                 wrong = row[(row < 0.0) | (row > 1.0)][0]
-                raise ValueError(
-                    f'markov: transition, row of "{name}", holds {wrong}; a probability lies in [0, 1]'
-                )
+                raise ValueError(f'markov: transition, row of "{name}", holds {wrong}; a probability lies in [0, 1]')
             if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
-                raise ValueError(
-                    f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1'
-                )
+                raise ValueError(f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1')
         if self.markov.initial not in modes:
-            raise ValueError(
-                f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}'
-            )
+            raise ValueError(f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}')
         return self
 
     @model_validator(mode="after")
@@ -328,9 +318,7 @@ def _with_adjacency(topology: Any, nodes: list[Any]) -> Any:
             if sender not in nodes:
                 raise ValueError(f"{where}: node {sender!r} does not exist; the nodes are {listed(nodes)}")
             adjacency[nodes.index(receiver), nodes.index(sender)] = 1.0
-    return {key: value for key, value in topology.items() if key != "hears"} | {
-        "adjacency": adjacency.tolist()
-    }
+    return {key: value for key, value in topology.items() if key != "hears"} | {"adjacency": adjacency.tolist()}
 
 
 def _read_csv(document: dict[str, Any], *, folder: Path) -> None:

@@ -87,9 +87,7 @@ class RecordingWriter:
             and 0 <= message.publish_time < 2**63
         ):  # a wrong argument would corrupt the open chunk under a valid checksum
             raise RunBroken(f"{self._path.name}: a message on {message.topic} cannot be recorded: {message}")
-        self._writer.add_message(
-            channel, message.log_time, message.payload, message.publish_time, message.number
-        )
+        self._writer.add_message(channel, message.log_time, message.payload, message.publish_time, message.number)
 
     def flush_when_due(self) -> float:
         """Flush and sync as often as promised; returns the seconds until it is due again."""
@@ -185,9 +183,7 @@ class RecordingReader:
             raise InputError(
                 f"{self.path} is cut or damaged before its first message: {_why(error)}; nothing can be read"
             ) from None
-        raise InputError(
-            f"{self.path} is an MCAP file, but not a recording of peakmesh: it has no run metadata"
-        )
+        raise InputError(f"{self.path} is an MCAP file, but not a recording of peakmesh: it has no run metadata")
 
     def messages(self) -> Iterator[Logged]:
         """Every message in the order of the file, as far as the file is sound."""

@@ -28,7 +28,6 @@ from agent.contract.messages import (
 from agent.contract.schedule import modes
 from agent.plan import Plan
 
-
 REPORT_SECONDS = 0.1
 
 

@@ -24,8 +24,9 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
     bus.advertise([estimate(node)])
     join(bus, gains)
 
-    x_hat, made_by = np.zeros(problem.nx), ("", [])
     k = 0
+    x_hat = np.zeros(problem.nx)
+    made_by: tuple[str, list[str]] = ("", [])  # the mode and the senders that made x_hat
     while True:
         while (y := inbox.measurement) is None:
             _take_in(inbox, bus.receive())
