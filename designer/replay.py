@@ -44,7 +44,7 @@ def tolerance(problem: Problem) -> float:
     """
     ny = sum(node.C.shape[0] for node in problem.nodes)
     n_eta = problem.nx * (problem.n + 1)
-    return 5.0 * (n_eta + ny + problem.nw + problem.n + 4) * UNIT
+    return float(5 * (n_eta + ny + problem.nw + problem.n + 4) * UNIT)
 
 
 def replay(path: FilePath) -> Verdict:
@@ -182,7 +182,5 @@ def _proofs(log: Log, tally: Tally, peak: tuple[Peak, float] | None) -> Iterator
     if peak is None:
         yield Proof(5, True, 0, 0.0, "real sensors: the error is not known")
     else:
-        margin = (
-            f"smallest margin {peak[0].margin:.1%}" if np.isfinite(peak[0].margin) else "nothing disturbed the run"
-        )
+        margin = f"smallest margin {peak[0].margin:.1%}" if np.isfinite(peak[0].margin) else "nothing disturbed the run"
         yield Proof(5, peak[0].holds, peak[0].compared, 0.0, margin)

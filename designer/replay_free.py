@@ -18,17 +18,13 @@ class FreeBlock(NamedTuple):
 
     first: int
     eta: Array  # (steps, n_eta): eta(k) from eta(0) = 0 by (10)
-    reach: (
-        Array  # (steps, n_eta): a relative rounding error of t in every step so far moves eta by t reach at most
-    )
+    reach: Array  # (steps, n_eta): a relative rounding error of t in every step so far moves eta by t reach at most
     path: Array  # (steps,): gamma_path(k), nan where it overflowed
 
 
 def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs:
     """Inputs without holes: what is not logged comes from the seed's draws, or from what the node made of it."""
-    mode = np.where(
-        (inputs.mode >= 0) & (inputs.mode < len(log.gains.problem.topologies)), inputs.mode, drawn.mode
-    )
+    mode = np.where((inputs.mode >= 0) & (inputs.mode < len(log.gains.problem.topologies)), inputs.mode, drawn.mode)
     if log.has_plant:
         theta = np.where(np.isnan(inputs.theta), drawn.theta, inputs.theta)
         return Inputs(mode, theta, np.where(np.isnan(inputs.w), drawn.w, inputs.w), inputs.u)

@@ -89,9 +89,7 @@ def load(path: Path) -> Log:
         planned=planned,
         steps=steps,
         messages=content.messages,
-        census=take_census(
-            counted, steps=expected, whole=finished, strange=content.strange, events=content.events
-        ),
+        census=take_census(counted, steps=expected, whole=finished, strange=content.strange, events=content.events),
         external=external,
         modes=content.modes,
         senders=content.senders,

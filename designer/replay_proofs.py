@@ -47,9 +47,7 @@ def numbers(
     return Check(proof, field, first, owner, gap, logged, expected)
 
 
-def names(
-    field: str, first: int, owner: Numbers, logged: Numbers, expected: Numbers, words: Sequence[str]
-) -> Check:
+def names(field: str, first: int, owner: Numbers, logged: Numbers, expected: Numbers, words: Sequence[str]) -> Check:
     unknown = (logged < 0) | (expected < 0)
     gap = np.where(unknown, np.nan, logged != expected)
     return Check(1, field, first, owner, gap, logged.astype(float), expected.astype(float), words)

@@ -33,9 +33,7 @@ class Divergence:
         whose = f'of node "{self.node}"' if self.node is not None else "of the plant"
         if self.field == "mode" and self.node is None:
             whose = "of the coordinator"
-        values = (
-            repr(value) if isinstance(value, float) else f'"{value}"' for value in (self.logged, self.expected)
-        )
+        values = (repr(value) if isinstance(value, float) else f'"{value}"' for value in (self.logged, self.expected))
         return "step {}: {} {} is {}, expected {}".format(self.step, self.field, whose, *values)
 
 
@@ -146,9 +144,7 @@ class Verdict:
             outcome = "FAILS" if not proof.holds else ("holds" if proof.compared else "  -  ")
             worst = f", worst gap {proof.worst_gap:.1e}" if proof.number <= 3 and proof.compared else ""
             note = f"; {proof.note}" if proof.note else ""
-            lines.append(
-                f"  {proof.number} {outcome}  {CLAIMS[proof.number]} ({proof.compared} compared{worst}{note})"
-            )
+            lines.append(f"  {proof.number} {outcome}  {CLAIMS[proof.number]} ({proof.compared} compared{worst}{note})")
         if self.first_divergence:
             lines.append(
                 f"first divergence, {self.first_divergence.text()}: "
@@ -177,9 +173,7 @@ class Verdict:
             return ["no simulated plant: estimates were compared, nothing is known of the error"]
         bound = self.gamma * self.energy**0.5
         margin = (
-            ""
-            if self.path_margin is None
-            else f"; smallest margin to this path's own bound {self.path_margin:.1%}"
+            "" if self.path_margin is None else f"; smallest margin to this path's own bound {self.path_margin:.1%}"
         )
         return [
             f"peak |z~| {self.peak:.4g}, gamma sqrt(energy) {bound:.4g} with gamma {self.gamma:.5g}{margin}",

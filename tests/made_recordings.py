@@ -84,9 +84,7 @@ def random_gains(problem: Problem, seed: int = 0) -> Gains:
         method="random",
         K=K,
         H=H,
-        certificate=Certificate(
-            gamma=1.0, kind="lyapunov", form="full", holds=False, verified="nothing", margins={}
-        ),
+        certificate=Certificate(gamma=1.0, kind="lyapunov", form="full", holds=False, verified="nothing", margins={}),
         solver=Solver(name="none", version="0", status="none", iterations=0, seconds=0.0),
         seconds={"total": 0.0},
     )
@@ -149,9 +147,7 @@ class _Numbered:
         self._sent: Counter[str] = Counter()
 
     def add(self, topic: str, sender: str, /, **document: Any) -> None:
-        plain = {
-            key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in document.items()
-        }
+        plain = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in document.items()}
         self.messages.append(Sent(topic, sender, self._sent[sender], plain))
         self._sent[sender] += 1
 
@@ -160,6 +156,7 @@ def record(
     path: Path,
     gains: Gains,
     sent: Sequence[Sent],
+    /,
     *,
     steps: int,
     seed: int = 1,
