@@ -1,0 +1,124 @@
+"""From a solver's answer, which lies on the boundary of (17), to a P and a gamma that the check confirms.
+
+A solver's P satisfies (17) with nothing to spare, or misses it by its tolerance. Take any P0 with
+P0 - L(P0) >= W/2 > 0, where L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i is the left upper corner of (17). Then
+(1 - t)(P + tau P0) has, on the diagonal of (17), t I more in w and tau W/2 more in eta; the cross terms that
+P0 brings are outweighed if tau <= t / (2 lambda_max(B'P0_bar B + 2 C'W^-1 C)), C = A'P0_bar B. So (17) becomes
+strict, and gamma grows by about t/2 of itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.problem import Problem
+from designer.certificate import Verdict, check, least_gamma
+from designer.error_model import ErrorModel, error_model
+
+_ABOVE = 1.0 + 1e-9  # gamma stands this factor above the infimum of (18), so that (18) is strict
+_MOST_STEPS = 5000
+
+
+class Confirmed(NamedTuple):
+    """The P that was tried last, in which form it is, how far it was backed off, and what the check says of it."""
+
+    P: Array  # (modes, n_eta, n_eta)
+    form: Literal["structured", "full"]
+    t: float
+    verdict: Verdict
+
+
+def back_off(problem: Problem, K_bar: Array, H_bar: Array, P: Array) -> Confirmed | None:
+    """The first P(t), from t = 0 upwards, whose gamma the check confirms; else the last one; None: none was > 0.
+
+    First with P0 = diag{R0, 0}, which keeps the form diag{R, Q(s)} of Theorem 1; then with a full P0.
+    """
+    model = error_model(problem, K_bar, H_bar)
+    tried = None
+    for form, t, candidate in _candidates(model, P):
+        if not _positive(candidate):
+            continue
+        gamma = least_gamma(model.M, candidate) * _ABOVE
+        tried = Confirmed(candidate, form, t, check(problem, K_bar, H_bar, P=candidate, gamma=gamma))
+        if tried.verdict.holds:
+            break
+    return tried
+
+
+def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Literal["structured", "full"], float, Array]]:
+    yield "structured", 0.0, P
+    P0 = plant_lyapunov(model, P)
+    if P0 is not None:
+        for t in (1e-8, 1e-7, 1e-6, 3e-6, 1e-5, 3e-5, 1e-4):
+            yield "structured", t, relaxed(model, P, P0, t)
+    P0 = coupled_lyapunov(model, P)
+    if P0 is not None:
+        for t in (1e-8, 1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3, 1e-2, 1e-1):
+            yield "full", t, relaxed(model, P, P0, t)
+
+
+def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
+    """P0 = W + L(W) + ... + L^k(W), as soon as L^(k+1)(W) <= W/2, so that P0 - L(P0) >= W/2; None: no such k.
+
+    The sum converges if and only if the error system is mean-square stable.
+    """
+    term, P0 = W, W.copy()
+    for _ in range(_MOST_STEPS):
+        term = corner(model, term)
+        if not np.isfinite(term).all():
+            return None
+        if _positive(W / 2.0 - term):
+            return P0
+        P0 = P0 + term
+    return None
+
+
+def plant_lyapunov(model: ErrorModel, P: Array) -> Array | None:
+    """P0 = diag{R0, 0} with R0 - A'R0 A >= R/2 for the plant alone, (modes, n_eta, n_eta)."""
+    p = model.plant_states
+    A, R = model.A[0, :p, :p], P[0, :p, :p]
+    term, R0 = R, R.copy()
+    for _ in range(_MOST_STEPS):
+        term = A.T @ term @ A
+        if _positive(R / 2.0 - term):
+            P0 = np.zeros_like(P)
+            P0[:, :p, :p] = R0
+            return P0
+        R0 = R0 + term
+    return None
+
+
+def corner(model: ErrorModel, P: Array) -> Array:
+    """L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i for every mode s, (modes, n_eta, n_eta)."""
+    p, result = model.plant_states, []
+    for s in range(len(P)):
+        P_bar = np.tensordot(model.transition[s], P, axes=1)
+        L = model.A[s].T @ P_bar @ model.A[s]
+        for alpha_i, F_i in zip(model.alpha, model.F[s], strict=True):
+            L[:p, :p] += alpha_i * (F_i.T @ P_bar[p:, p:] @ F_i)
+        result.append((L + L.T) / 2.0)
+    return np.array(result)
+
+
+def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:
+    """(1 - t)(P + tau P0) with the tau of this module's first lines, for W = P."""
+    worst = 0.0
+    for s in range(len(P)):
+        P0_bar = np.tensordot(model.transition[s], P0, axes=1)
+        C = model.A[s].T @ P0_bar @ model.B[s]
+        grown = model.B[s].T @ P0_bar @ model.B[s] + 2.0 * C.T @ np.linalg.solve(P[s], C)
+        worst = max(worst, float(np.linalg.eigvalsh((grown + grown.T) / 2.0).max()))
+    tau = t / (2.0 * worst) if worst > 0.0 else t
+    return np.asarray((1.0 - t) * (P + tau * P0))
+
+
+def _positive(P: Array) -> bool:
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -1,0 +1,123 @@
+"""From a problem to gains: pick a method, solve, recover the gains by (38), check, and back off where needed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.errors import InputError, Unattainable, listed
+from agent.contract.gains import Certificate, Gains
+from agent.contract.problem import Problem
+from designer.back_off import Confirmed, back_off
+from designer.certificate import Verdict
+from designer.error_model import link_gains
+from designer.lmi import LmiSolution
+
+
+def design(problem: Problem, *, method: str = "theorem2") -> Gains:
+    """Gains for every mode and link, with a gamma that the check without a solver confirms.
+
+    Raises InputError for an unknown method, Unattainable where no gains or no certificate were found.
+    """
+    if method not in METHODS:
+        raise InputError(f'method "{method}" does not exist; the methods are {listed(METHODS)}')
+    if not problem.plant.M.any():
+        raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
+    started = time.perf_counter()
+    solution = METHODS[method](problem)
+    solved = time.perf_counter()
+    K_bar, H_bar = recover(problem, solution)
+    confirmed = _confirm(problem, K_bar, H_bar, solution)
+    K, H = link_gains(problem, K_bar, H_bar)
+    ended = time.perf_counter()
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method=method,
+        K=K,
+        H=H,
+        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
+        solver=solution.solver,
+        seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
+    )
+
+
+def recover(problem: Problem, solution: LmiSolution) -> tuple[Array, Array]:
+    """Eq. (38): K_bar^s = Q_bar(s)^-1 Y^s (modes, n nx, n nx) and H_bar^s = Q_bar(s)^-1 X^s (modes, n nx, sum ny).
+
+    Node by node: Q_bar is block diagonal, so a block that is zero in X and Y stays exactly zero.
+    """
+    modes, n, nx = len(problem.topologies), problem.n, problem.nx
+    Q_bar = np.tensordot(problem.markov.transition, solution.Q, axes=1)  # (modes, n, nx, nx)
+    try:
+        K = np.linalg.solve(Q_bar, solution.Y.reshape(modes, n, nx, -1))
+        H = np.linalg.solve(Q_bar, solution.X.reshape(modes, n, nx, -1))
+    except np.linalg.LinAlgError:
+        raise _unconfirmed(problem, solution, None) from None
+    return K.reshape(solution.Y.shape), H.reshape(solution.X.shape)
+
+
+def block_diagonal(R: Array, Q: Array) -> Array:
+    """P(s) = diag{R, Q_1(s), ..., Q_n(s)}, (modes, nx (n + 1), nx (n + 1)), from R (nx, nx), Q (modes, n, nx, nx)."""
+    modes, n, nx, _ = Q.shape
+    P = np.zeros((modes, n + 1, nx, n + 1, nx))
+    P[:, 0, :, 0, :] = R
+    for i in range(n):
+        P[:, i + 1, :, i + 1, :] = Q[:, i]
+    return P.reshape(modes, nx * (n + 1), nx * (n + 1))
+
+
+def _confirm(problem: Problem, K_bar: Array, H_bar: Array, solution: LmiSolution) -> Confirmed:
+    """What the check says of the gains as a file will hold them, or Unattainable."""
+    if not (np.isfinite(K_bar).all() and np.isfinite(H_bar).all() and math.isfinite(solution.gamma)):
+        raise _unconfirmed(problem, solution, None)
+    confirmed = back_off(problem, K_bar, H_bar, block_diagonal(solution.R, solution.Q))
+    if confirmed is None or not confirmed.verdict.holds:
+        raise _unconfirmed(problem, solution, confirmed.verdict if confirmed else None)
+    return confirmed
+
+
+def _unconfirmed(problem: Problem, solution: LmiSolution, verdict: Verdict | None) -> Unattainable:
+    why = (verdict and verdict.failure) or "P is not positive definite"
+    return Unattainable(
+        f"{solution.solver.name} says {solution.solver.status} with gamma {solution.gamma:.6g} for {problem.name}, "
+        f"but the check without a solver does not confirm its answer ({why}); "
+        "try the problem in other units, so that its numbers are near 1"
+    )
+
+
+def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float) -> Certificate:
+    P, verdict, nx = confirmed.P, confirmed.verdict, problem.nx
+    modes, nodes = problem.mode_names, problem.node_names
+    structured = confirmed.form == "structured"
+    parts = [slice(i * nx, (i + 1) * nx) for i in range(1, problem.n + 1)]
+    return Certificate(
+        gamma=verdict.gamma,
+        kind="lyapunov",
+        form=confirmed.form,
+        R=P[0, :nx, :nx] if structured else None,
+        Q={
+            mode: {node: P[s, part, part] for node, part in zip(nodes, parts, strict=True)}
+            for s, mode in enumerate(modes)
+        }
+        if structured
+        else None,
+        P=None if structured else dict(zip(modes, P, strict=True)),
+        lmi_gamma=lmi_gamma,
+        holds=verdict.holds,
+        verified=f"(17) and (18) of Theorem 1 in every mode, for the numbers stored here: {verdict.arithmetic}",
+        margins=verdict.margins,
+    )
+
+
+def _theorem2(problem: Problem) -> LmiSolution:
+    from designer.lmi import theorem2  # cvxpy takes seconds to import, so only who solves pays for it
+
+    return theorem2.solve(problem)
+
+
+METHODS: dict[str, Callable[[Problem], LmiSolution]] = {"theorem2": _theorem2}
