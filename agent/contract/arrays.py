@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator
 
+from agent.contract.errors import counted, shortened
 from agent.contract.files import canonical, digest
 
 Array = NDArray[np.float64]
@@ -16,9 +18,7 @@ Array = NDArray[np.float64]
 class Model(BaseModel):
     """Frozen, and strict about keys: an unknown one is refused, never ignored."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", arbitrary_types_allowed=True, populate_by_name=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
 
     def document(self) -> Any:
         """The model as plain lists, dicts, strings and numbers, under the names used in files."""
@@ -51,15 +51,15 @@ def _matrix(value: Any) -> Array:
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not (isinstance(value, list) and value and all(isinstance(row, list) and row for row in value)):
-        raise ValueError(f"must be a matrix, a list of rows such as [[1.0, 0.0]], got {str(value)[:60]}")
+        raise ValueError(f"must be a matrix, a list of rows such as [[1.0, 0.0]], got {shortened(value)}")
     for number, row in enumerate(value, 1):
         if len(row) != len(value[0]):
-            raise ValueError(f"row {number} has {len(row)} entries where row 1 has {len(value[0])}")
+            raise ValueError(f"row {number} has {counted(len(row), 'entry')}; row 1 has {len(value[0])}")
         for entry in row:
             if isinstance(entry, bool) or not isinstance(entry, int | float):
-                raise ValueError(f"row {number} holds {entry!r}, which is not a number")
-            if not np.isfinite(entry):
-                raise ValueError(f"row {number} holds {entry}; every entry must be finite")
+                raise ValueError(f"row {number} holds {shortened(entry)}, which is not a number")
+            if not abs(entry) <= sys.float_info.max:  # NaN, infinity, or an integer beyond float64
+                raise ValueError(f"row {number} holds {shortened(entry)}; every entry must be a finite float64")
     return read_only(np.array(value, dtype=np.float64))
 
 

@@ -81,8 +81,29 @@ def first_fault(error: ValidationError, document: Any) -> str:
             return f"{place}this key is not known here{hint}"
         case "value_error":
             return f"{place}{fault['ctx']['error']}"
-        case _:
-            return f"{place}{_lower(fault['msg'])}, got {_short(fault['input'])}"
+        case "union_tag_not_found":
+            return f'{place}"kind" is missing'
+        case "union_tag_invalid":
+            known = fault["ctx"]["expected_tags"].replace("'", '"')
+            return f'{place}kind "{fault["ctx"]["tag"]}" is not known; there are {known}'
+        case kind:
+            wanted = _WANTED.get(kind, _lower(fault["msg"])).format(**fault.get("ctx", {}))
+            return f"{place}{wanted}, got {shortened(fault['input'])}"
+
+
+_WANTED = {  # what pydantic asks for, as a person says it who writes TOML
+    "string_type": "must be a string",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "finite_number": "must be finite",
+    "greater_than": "must be greater than {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "model_type": "must be a table of keys and values",
+    "dict_type": "must be a table of keys and values",
+    "tuple_type": "must be a list",
+    "list_type": "must be a list",
+    "too_short": "must have at least {min_length}",
+}
 
 
 def _place(location: tuple[int | str, ...], document: Any) -> str:
@@ -96,14 +117,26 @@ def _place(location: tuple[int | str, ...], document: Any) -> str:
             continue  # a missing key, or the tag of a union, which is no place in the document
         if isinstance(step, int):
             name = here.get("name") if isinstance(here, dict) else None
-            words[-1] += f' "{name}"' if isinstance(name, str) else f" number {step + 1}"
+            named = isinstance(name, str) and name.isprintable()
+            words[-1] += f' "{name}"' if named else f" number {step + 1}"
         else:
             words.append(str(step))
     return "".join(f"{word}: " for word in words)
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
+def counted(number: int, noun: str) -> str:
+    """ "1 entry", "2 entries"."""
+    if number == 1:
+        return f"1 {noun}"
+    return f"{number} {noun.removesuffix('y')}ies" if noun.endswith("y") else f"{number} {noun}s"
+
+
+def shortened(value: Any) -> str:
+    """A value as Python writes it, in 60 characters at most."""
+    try:
+        text = repr(value)
+    except ValueError:
+        return "an integer of thousands of digits"
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -76,7 +76,7 @@ class Gains(Model):
         """Gains from the bytes of a gains.json; `source` names them in errors."""
         try:
             document = json.loads(data)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{source} is not a gains file: it is not valid JSON: {error}") from None
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise InputError(f'{source} is not a gains file: it does not say "format": "{FORMAT}"')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import tomllib
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, shape_text
-from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.errors import InputError, counted, first_fault, listed, shortened
 from agent.contract.files import read_bytes
 
 ROW_SUM_TOLERANCE = 1e-9
@@ -21,7 +20,7 @@ ROW_SUM_TOLERANCE = 1e-9
 
 def _legal_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
-        raise ValueError(f'"{name}" is not a legal name: use 1 to 64 letters, digits, "-" and "_"')
+        raise ValueError(f'{shortened(name)} is not a legal name: use 1 to 64 letters, digits, "-" and "_"')
     return name
 
 
@@ -42,9 +41,11 @@ class Plant(Model):
         if self.A.shape[1] != nx:
             raise ValueError(f"A is {shape_text(self.A)}; it must be square")
         if self.B.shape[0] != nx:
-            raise ValueError(f"B is {shape_text(self.B)}; A is {shape_text(self.A)}, so B needs {nx} rows")
+            raise ValueError(f"B is {shape_text(self.B)}; A is {shape_text(self.A)}, so B needs {counted(nx, 'row')}")
         if self.M.shape[1] != nx:
-            raise ValueError(f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {nx} columns")
+            raise ValueError(
+                f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {counted(nx, 'column')}"
+            )
         radius = float(np.abs(np.linalg.eigvals(self.A)).max())
         if radius >= 1.0:
             raise ValueError(
@@ -153,7 +154,7 @@ class Problem(Model):
         data = read_bytes(path, kind="problem file")
         try:
             document = tomllib.loads(data.decode())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is not a problem file: it is not valid TOML: {error}") from None
         try:
             _read_csv(document, folder=path.parent)
@@ -240,13 +241,13 @@ class Problem(Model):
         for node in self.nodes:
             if node.C.shape[1] != self.nx:
                 raise ValueError(
-                    f'node "{node.name}": C is {shape_text(node.C)}; the plant has {self.nx} states, '
-                    f"so C needs {self.nx} columns"
+                    f'node "{node.name}": C is {shape_text(node.C)}; the plant has {counted(self.nx, "state")}, '
+                    f"so C needs {counted(self.nx, 'column')}"
                 )
             if node.D.shape[1] != self.nw:
                 raise ValueError(
-                    f'node "{node.name}": D is {shape_text(node.D)}; the plant has {self.nw} disturbances, '
-                    f"so D needs {self.nw} columns"
+                    f'node "{node.name}": D is {shape_text(node.D)}; the plant has {counted(self.nw, "disturbance")}, '
+                    f"so D needs {counted(self.nw, 'column')}"
                 )
         return self
 
@@ -256,7 +257,9 @@ class Problem(Model):
         for topology in self.topologies:
             adjacency, where = topology.adjacency, f'topology "{topology.name}": adjacency'
             if adjacency.shape != (self.n, self.n):
-                raise ValueError(f"{where} is {shape_text(adjacency)}; {self.n} nodes need {self.n} x {self.n}")
+                raise ValueError(
+                    f"{where} is {shape_text(adjacency)}; for {counted(self.n, 'node')} it must be {self.n} x {self.n}"
+                )
             for i, receiver in enumerate(self.node_names):
                 for j, sender in enumerate(self.node_names):
                     if adjacency[i, j] < 0.0:
@@ -274,7 +277,7 @@ class Problem(Model):
         if transition.shape != (len(modes), len(modes)):
             raise ValueError(
                 f"markov: transition is {shape_text(transition)}; "
-                f"{len(modes)} topologies need {len(modes)} x {len(modes)}"
+                f"for {counted(len(modes), 'topology')} it must be {len(modes)} x {len(modes)}"
             )
         for name, row in zip(modes, transition, strict=True):
             if (row < 0.0).any() or (row > 1.0).any():
@@ -283,15 +286,17 @@ class Problem(Model):
             if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
                 raise ValueError(f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1')
         if self.markov.initial not in modes:
-            raise ValueError(f'markov: initial "{self.markov.initial}" is no topology; there are {listed(modes)}')
+            raise ValueError(
+                f'markov: initial "{self.markov.initial}" is no topology; the topologies are {listed(modes)}'
+            )
         return self
 
     @model_validator(mode="after")
     def _check_disturbance(self) -> Self:
         if isinstance(self.disturbance, Samples) and self.disturbance.values.shape[1] != self.nw:
             raise ValueError(
-                f'disturbance: "{self.disturbance.file}" has {self.disturbance.values.shape[1]} columns; '
-                f"the plant has {self.nw} disturbances"
+                f'disturbance: "{self.disturbance.file}" has {counted(self.disturbance.values.shape[1], "column")}; '
+                f"the plant has {counted(self.nw, 'disturbance')}"
             )
         return self
 
@@ -299,7 +304,7 @@ class Problem(Model):
 def _refuse_duplicates(kind: str, names: tuple[str, ...]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f'{kind} "{name}" stands there {names.count(name)} times; names must differ')
+            raise ValueError(f'{kind} "{name}" is there {names.count(name)} times; names must differ')
 
 
 def _with_adjacency(topology: Any, nodes: list[Any]) -> Any:
@@ -316,7 +321,8 @@ def _with_adjacency(topology: Any, nodes: list[Any]) -> Any:
     for receiver, heard in hears.items():
         for sender in (receiver, *heard):
             if sender not in nodes:
-                raise ValueError(f"{where}: node {sender!r} does not exist; the nodes are {listed(nodes)}")
+                name = f'"{sender}"' if isinstance(sender, str) else shortened(sender)
+                raise ValueError(f"{where}: node {name} does not exist; the nodes are {listed(nodes)}")
             adjacency[nodes.index(receiver), nodes.index(sender)] = 1.0
     return {key: value for key, value in topology.items() if key != "hears"} | {"adjacency": adjacency.tolist()}
 
@@ -327,11 +333,13 @@ def _read_csv(document: dict[str, Any], *, folder: Path) -> None:
     if not (isinstance(disturbance, dict) and disturbance.get("kind") == "csv" and "file" in disturbance):
         return
     path = folder / str(disturbance["file"])
-    text = read_bytes(path, kind="CSV file of the disturbance").decode(errors="replace")
+    text = read_bytes(path, kind="CSV file of the disturbance").decode("utf-8-sig", errors="replace")
     rows: list[list[float]] = []
-    for number, row in enumerate(csv.reader(text.splitlines()), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         try:
-            rows.append([float(entry) for entry in row])
+            rows.append([float(entry) for entry in line.split(",")])
         except ValueError:
-            raise InputError(f"disturbance: {path}, row {number} is not all numbers: {row}") from None
+            raise InputError(f"disturbance: {path}, row {number} is not all numbers: {shortened(line)}") from None
+    if not rows:
+        raise InputError(f"disturbance: {path} is empty; it needs a row of numbers for each step")
     disturbance["values"] = rows
