@@ -1,0 +1,27 @@
+"""Built-in problems, each a problem.toml that says where its numbers come from."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from agent.contract.errors import InputError, listed
+from agent.contract.problem import Problem
+
+_SUFFIX = ".toml"
+
+
+def names() -> tuple[str, ...]:
+    """The built-in problems, in alphabetical order."""
+    found = (entry.name for entry in files(__name__).iterdir())
+    return tuple(sorted(name.removesuffix(_SUFFIX) for name in found if name.endswith(_SUFFIX)))
+
+
+def find(text: str) -> Problem:
+    """A built-in problem by its name, or the problem file at that path. Raises InputError where there is neither."""
+    if text in names():
+        with as_file(files(__name__) / f"{text}{_SUFFIX}") as path:
+            return Problem.load(path)
+    if not Path(text).exists():
+        raise InputError(f'"{text}" is neither a problem file nor a built-in problem; built in are {listed(names())}')
+    return Problem.load(Path(text))
