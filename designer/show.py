@@ -1,0 +1,148 @@
+"""What a file is: a problem, gains, or a recording."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from agent.contract.errors import InputError, listed
+from agent.contract.files import read_bytes
+from agent.contract.gains import Gains
+from agent.contract.problem import Problem
+from agent.contract.recording import RecordingReader
+
+MCAP_MAGIC = b"\x89MCAP"
+PROBLEMS = Path(__file__).parent / "problems"
+
+
+def describe(file: str | Path | None = None) -> dict[str, Any]:
+    """The facts of a file, or of a built-in problem given by its name; without one, the built-in problems.
+
+    `kind` is "problem", "gains", "recording" or "built-in problems". Raises InputError for anything else.
+    """
+    if file is None:
+        return {"kind": "built-in problems", "problems": {name: _size(_built_in(name)) for name in built_in_names()}}
+    path = Path(file)
+    if not path.exists():
+        if str(file) in built_in_names():
+            return _problem(_built_in(str(file)))
+        raise InputError(f"{path} does not exist, nor is it a built-in problem; these are {listed(built_in_names())}")
+    data = read_bytes(path, kind="problem, gains file or recording")
+    if data.startswith(MCAP_MAGIC):
+        return {"file": str(path), **_recording(path)}
+    if data.lstrip().startswith(b"{"):
+        return {"file": str(path), **_gains(Gains.from_bytes(data, source=str(path)))}
+    if path.suffix == ".toml":
+        return {"file": str(path), **_problem(Problem.load(path))}
+    raise InputError(f"{path} is neither a problem (.toml), nor a gains file (JSON), nor a recording (MCAP)")
+
+
+def text(facts: dict[str, Any]) -> str:
+    """The same for people: a line for each fact, topics of all nodes taken together."""
+    if "messages" in facts:
+        facts = facts | {"messages": _by_kind(facts["messages"])}
+    width = max(map(len, facts)) + 2
+    return "\n".join(f"{name.replace('_', ' '):{width}}{_plain(value)}" for name, value in facts.items())
+
+
+def built_in_names() -> list[str]:
+    """The names of the problems that come with peakmesh."""
+    return sorted(path.stem for path in PROBLEMS.glob("*.toml"))
+
+
+def _built_in(name: str) -> Problem:
+    return Problem.load(PROBLEMS / f"{name}.toml")
+
+
+def _size(problem: Problem) -> str:
+    return f"{problem.n} nodes, {problem.nx} states, {len(problem.topologies)} modes"
+
+
+def _problem(problem: Problem) -> dict[str, Any]:
+    return {
+        "kind": "problem",
+        "name": problem.name,
+        "nodes": list(problem.node_names),
+        "modes": list(problem.mode_names),
+        "states": problem.nx,
+        "disturbances": problem.nw,
+        "outputs": problem.nz,
+        "measurements": sum(len(node.C) for node in problem.nodes),
+        "arrival_probability": problem.beta.tolist(),
+        "disturbance": problem.disturbance.kind,
+        "digest": problem.digest(),
+    }
+
+
+def _gains(gains: Gains) -> dict[str, Any]:
+    proved, solver = gains.certificate, gains.solver
+    return {
+        "kind": "gains",
+        "problem": gains.problem.name,
+        "size": _size(gains.problem),
+        "method": gains.method,
+        "gamma": proved.gamma,
+        "certificate": f"{proved.kind}, {proved.form} P",
+        "holds": proved.holds,
+        "verified": proved.verified,
+        "lmi_gamma": proved.lmi_gamma,
+        "exact": None if proved.exact is None else list(proved.exact),
+        "floor": proved.floor,
+        "solver": f"{solver.name} {solver.version}: {solver.status}, {solver.iterations} iterations",
+        "seconds": gains.seconds.get("total"),
+        "digest": gains.digest(),
+    }
+
+
+def _recording(path: Path) -> dict[str, Any]:
+    with RecordingReader(path) as reader:
+        counts = Counter(logged.topic for logged in reader.messages())
+        run, end, gains = reader.run, reader.end or {}, reader.gains
+    return {
+        "kind": "recording",
+        "run": run.get("run", ""),
+        "problem": gains.problem.name,
+        "size": _size(gains.problem),
+        "gains": gains.digest(),
+        "gamma": gains.certificate.gamma,
+        "seed": run.get("seed", ""),
+        "steps": run.get("steps", ""),
+        "complete_steps": end.get("steps"),
+        "external": [name for name in run.get("external", "").split(",") if name],
+        "started": run.get("started", ""),
+        "messages": dict(sorted(counts.items())),
+        "missing": {
+            key.removeprefix("missing."): int(count)
+            for key, count in end.items()
+            if key.startswith("missing.") and count.isdigit() and int(count)
+        },
+        "status": end.get("status", "cut: it has no end"),
+        "reason": end.get("reason", ""),
+        "damage": reader.damage,
+    }
+
+
+def _by_kind(counts: dict[str, int]) -> dict[str, int]:
+    """Messages of each kind of topic: node/<n>/estimate for all nodes together."""
+    kinds: Counter[str] = Counter()
+    for topic, count in counts.items():
+        words = topic.split("/")
+        kinds["/".join(["node", "*", *words[2:]]) if words[0] == "node" else topic] += count
+    return {"all": sum(kinds.values()), **kinds}
+
+
+def _plain(value: Any) -> str:
+    if value is None or value in ("", [], {}):
+        return "-"
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.6g}"
+        case list():
+            shown = [_plain(entry) for entry in value]
+            return ", ".join(shown if len(shown) <= 12 else [*shown[:10], f"... {len(shown) - 11} more ...", shown[-1]])
+        case dict():
+            return "; ".join(f"{name}: {_plain(entry)}" for name, entry in value.items())
+    return str(value)

@@ -1,0 +1,85 @@
+"""`show` says what a file is, or in one sentence why it is nothing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from made_recordings import random_gains, random_problem, record, simulate
+
+from agent.contract.errors import InputError
+from designer import show
+
+GAINS = random_gains(random_problem(3))
+STEPS = 12
+
+
+def test_a_built_in_problem_is_described_by_name_and_by_path() -> None:
+    facts = show.describe("zhu2020-lossy")
+    assert facts["kind"] == "problem"
+    assert facts["nodes"] == ["1", "2", "3", "4"]
+    assert facts["arrival_probability"] == [0.79, 0.85, 0.78, 0.92]
+    assert (facts["states"], len(facts["modes"]), len(facts["digest"])) == (2, 4, 64)
+    by_path = show.describe(show.PROBLEMS / "zhu2020-lossy.toml")
+    assert by_path.pop("file").endswith("zhu2020-lossy.toml")
+    assert by_path == facts
+
+
+def test_without_a_file_the_built_in_problems_are_listed() -> None:
+    facts = show.describe()
+    assert facts["problems"]["zhu2020-ideal"] == "4 nodes, 2 states, 4 modes"
+    assert "zhu2020-lossy: 4 nodes" in show.text(facts)
+
+
+def test_gains_are_described(tmp_path: Path) -> None:
+    path = tmp_path / "gains.json"
+    GAINS.save(path)
+    facts = show.describe(str(path))
+    assert (facts["kind"], facts["method"], facts["gamma"], facts["holds"]) == ("gains", "random", 1.0, False)
+    assert facts["digest"] == GAINS.digest()
+    assert "none 0: none, 0 iterations" in show.text(facts)
+
+
+def test_a_recording_is_described(tmp_path: Path) -> None:
+    sent = simulate(GAINS, steps=STEPS)
+    facts = show.describe(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS))
+    assert facts["kind"] == "recording"
+    assert facts["messages"] == Counter(message.topic for message in sent)
+    assert (facts["run"], facts["seed"], facts["steps"], facts["status"]) == ("test", "1", "12", "finished")
+    assert facts["damage"] == ""
+    assert f"node/*/estimate: {4 * STEPS}" in show.text(facts)
+    json.dumps(facts, allow_nan=False)
+
+
+def test_a_cut_recording_says_so(tmp_path: Path) -> None:
+    sent = simulate(GAINS, steps=STEPS)
+    facts = show.describe(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS, whole=False))
+    assert facts["status"] == "cut: it has no end"
+    assert facts["complete_steps"] is None
+    assert "cut or damaged" in facts["damage"]
+
+
+def test_what_is_none_of_these_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    gains = GAINS.canonical()
+    recording = record(tmp_path / "run.mcap", GAINS, simulate(GAINS, steps=STEPS), steps=STEPS).read_bytes()
+    for name, data, why in (
+        ("photo.png", b"\x89PNG\r\n\x1a\n", "is neither a problem"),
+        ("empty", b"", "is neither a problem"),
+        ("cut.json", gains[: len(gains) // 2], "is not valid JSON"),
+        ("other.json", b'{"format": "other"}', "is not a gains file"),
+        ("cut.mcap", recording[:300], "cut or damaged before its first message"),
+        ("bad.toml", b"name = ", "is not valid TOML"),
+        ("other.toml", b'name = "x"\n[tool]\na = 1\n', "this key is not known here"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=why) as raised:
+            show.describe(path)
+        assert str(path) in str(raised.value)
+        assert "\n" not in str(raised.value)
+    with pytest.raises(InputError, match=r'does not exist, nor is it a built-in problem; these are .*"zhu2020-lossy"'):
+        show.describe(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="could not be read"):
+        show.describe(tmp_path)
