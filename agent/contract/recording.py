@@ -14,13 +14,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import IO, NamedTuple, Self
 
 import zstandard
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Metadata
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from agent.contract.errors import InputError, RunBroken
@@ -36,7 +36,8 @@ CHUNK_SIZE = 256 * 1024
 FLUSH_SECONDS = 0.25  # a killed recorder loses what came after the last flush
 SYNC_SECONDS = 1.0  # a power cut, what came after the last sync
 
-_DAMAGE = (McapError, struct.error, ValueError, zstandard.ZstdError, KeyError, EOFError)
+# A damaged length asks for more memory than there is, or than a machine can count.
+_DAMAGE = (McapError, struct.error, ValueError, zstandard.ZstdError, KeyError, EOFError, MemoryError, OverflowError)
 
 
 class Logged(NamedTuple):
@@ -57,7 +58,10 @@ class RecordingWriter:
         self._path = path
         self._part = path.with_name(path.name + ".part")
         refuse_overwrite(self._part, force=force)
-        self._file = self._part.open("wb")
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise InputError(f"{path} could not be written: {error.strerror}") from error
         self._writer = Writer(
             self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True
         )
@@ -82,9 +86,9 @@ class RecordingWriter:
             channel = self._register(message.topic)
         if not (
             isinstance(message.payload, bytes)
-            and 0 <= message.number < 2**32
-            and 0 <= message.log_time < 2**63
-            and 0 <= message.publish_time < 2**63
+            and _counts(message.number, 2**32)
+            and _counts(message.log_time, 2**63)
+            and _counts(message.publish_time, 2**63)
         ):  # a wrong argument would corrupt the open chunk under a valid checksum
             raise RunBroken(f"{self._path.name}: a message on {message.topic} cannot be recorded: {message}")
         self._writer.add_message(channel, message.log_time, message.payload, message.publish_time, message.number)
@@ -102,6 +106,7 @@ class RecordingWriter:
 
     def finish(self, end: dict[str, str]) -> None:
         """Write `end`, the index, and give the file its name."""
+        self._writer.flush()  # the messages first: where `end` can be read, nothing was cut before it
         self._writer.add_metadata("end", end)
         self._writer.finish()
         self._file.flush()
@@ -154,7 +159,7 @@ class RecordingReader:
             raise InputError(f"{path} does not exist; a recording was expected there") from None
         except OSError as error:
             raise InputError(f"{path} could not be read as a recording: {error.strerror}") from error
-        self._records = StreamReader(self._file, validate_crcs=True).records
+        self._records = _records(self._file)
         self._channels: dict[int, str] = {}
         try:
             self.run, self.gains = self._read_head()
@@ -217,8 +222,23 @@ class RecordingReader:
         self._file.close()
 
 
+def _records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """The records of a file; messages only out of chunks, where a checksum covers them."""
+    for record in StreamReader(file, validate_crcs=True, emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            yield from breakup_chunk(record, validate_crc=True)
+        elif not isinstance(record, McapMessage):  # one outside a chunk is another record, damaged
+            yield record
+
+
+def _counts(value: object, limit: int) -> bool:
+    return isinstance(value, int) and 0 <= value < limit
+
+
 def _why(error: Exception) -> str:
     text = str(error).rstrip(".")
-    if not text:
+    if isinstance(error, EndOfFile | struct.error):
         return "the file ends in the middle of a record"
+    if isinstance(error, MemoryError | OverflowError):
+        return "a record claims to be larger than memory"
     return f"{type(error).__name__}: {text}"
