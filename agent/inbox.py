@@ -11,6 +11,7 @@ from collections import defaultdict
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.errors import listed
 from agent.contract.gains import NodeGains
 from agent.contract.messages import Estimate, Measurement, Message, Mode
 from agent.filter import Pair
@@ -22,6 +23,9 @@ class Inbox:
     def __init__(self, gains: NodeGains) -> None:
         self._hears = {mode: [link.sender for link in links] for mode, links in gains.links.items()}
         self._ny = gains.C.shape[0]
+        self._sizes = {  # of each sender's pair
+            link.sender: (link.K.shape[1], link.H.shape[1]) for links in gains.links.values() for link in links
+        }
         self._step = 0
         self._measurements: dict[int, Array] = {}
         self._modes: dict[int, str] = {}
@@ -34,13 +38,21 @@ class Inbox:
         match message:
             case Mode(step=step, mode=mode):
                 if mode not in self._hears:
-                    raise ValueError(f'mode "{mode}" does not exist; the gains have {", ".join(self._hears)}')
+                    raise ValueError(f'mode "{mode}" does not exist; the gains have {listed(self._hears)}')
                 self._modes[step] = mode
             case Measurement(step=step, y=y):
                 if len(y) != self._ny:
-                    raise ValueError(f"a measurement of step {step} has {len(y)} numbers; the node has {self._ny}")
+                    raise ValueError(f"the measurement of step {step} has {len(y)} numbers; it must have {self._ny}")
                 self._measurements[step] = np.array(y)
             case Estimate(step=step, x_hat=x_hat, innovation=innovation):
+                if sender not in self._sizes:
+                    raise ValueError(f'node "{sender}" is heard in no mode; heard are {listed(self._sizes)}')
+                sizes = len(x_hat), len(innovation)
+                if sizes != self._sizes[sender]:
+                    raise ValueError(
+                        f'the estimate of step {step} from node "{sender}" has {sizes[0]} states and {sizes[1]} '
+                        f"innovations; it must have {self._sizes[sender][0]} and {self._sizes[sender][1]}"
+                    )
                 self._pairs[step][sender] = Pair(np.array(x_hat), np.array(innovation))
 
     @property
