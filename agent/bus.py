@@ -353,7 +353,10 @@ def _payload(raw: Raw) -> bytes:
 
 def _sample(raw: Raw) -> Sample:
     attachment = raw.content.attachment
-    stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    try:
+        stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    except ValueError as error:
+        raise RunBroken(f"a message on {raw.topic} has no readable stamp: {error}") from None
     return Sample(raw.topic, raw.content.payload.to_bytes(), stamp, raw.time)
 
 

@@ -36,11 +36,11 @@ from agent.contract.problem import Problem
 
 
 class Message(BaseModel):
-    """Flat, frozen, finite: NaN and infinity are refused, unknown fields too."""
+    """Flat, frozen, finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
-    step: int = Field(ge=0)
+    step: int = Field(ge=0, lt=2**63)
 
     def encode(self) -> bytes:
         """JSON; every float64 comes back bit for bit."""
@@ -121,7 +121,8 @@ class Acknowledged(BaseModel):
     """The recorder's word: it holds the first `received[who]` messages of everyone, and every step < `steps`.
 
     `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of
-    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name; everybody may go.
+    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name;
+    everybody may go.
     """
 
     steps: int
@@ -145,6 +146,9 @@ class Stamp(NamedTuple):
 
     @classmethod
     def decode(cls, attachment: bytes) -> Self:
+        """Raises ValueError for anything else than a stamp."""
+        if len(attachment) <= _STAMP.size:
+            raise ValueError(f"a stamp is longer than {_STAMP.size} bytes, this one has {len(attachment)}")
         number, time = _STAMP.unpack_from(attachment)
         return cls(number, time, attachment[_STAMP.size :].decode())
 
