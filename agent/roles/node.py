@@ -31,14 +31,17 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
         while (y := inbox.measurement) is None:
             _take_in(inbox, bus.receive())
         pair = Pair(x_hat, innovation(own, y, x_hat))
-        sent = Estimate(
-            step=k,
-            x_hat=pair.x_hat.tolist(),
-            innovation=pair.innovation.tolist(),
-            z_hat=(own.M @ x_hat).tolist(),
-            mode=made_by[0],
-            heard=made_by[1],
-        )
+        try:
+            sent = Estimate(
+                step=k,
+                x_hat=pair.x_hat.tolist(),
+                innovation=pair.innovation.tolist(),
+                z_hat=(own.M @ x_hat).tolist(),
+                mode=made_by[0],
+                heard=made_by[1],
+            )
+        except ValidationError:  # a message refuses NaN and infinity
+            raise RunBroken(f'the estimate of node "{node}" is not finite at step {k}; its gains let it grow') from None
         bus.publish(estimate(node), sent)
         inbox.put(node, sent)
         while (lacking := inbox.lacking) > 0:

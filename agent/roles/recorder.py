@@ -42,8 +42,15 @@ def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
     bus.subscribe([MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)])
     start = join(bus, gains)
     facts = _facts(bus.run, gains, start)
-    with RecordingWriter(path, run=facts, gains=gains, force=force) as writer:
-        recorder = Recorder(bus, gains, writer, window=start.window)
+    try:
+        _record(bus, gains, RecordingWriter(path, run=facts, gains=gains, force=force), window=start.window)
+    except OSError as error:
+        raise RunBroken(f"{path} could not be written: {error.strerror}") from error
+
+
+def _record(bus: Bus, gains: Gains, writer: RecordingWriter, *, window: int) -> None:
+    with writer:
+        recorder = Recorder(bus, gains, writer, window=window)
         try:
             recorder.record()
         except RunClosed as closed:
