@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import secrets
 import signal
 import sys
@@ -218,7 +219,9 @@ def _recording_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _network_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--run", metavar="NAME", help="name of the run, the same for everybody (the problem's name)")
+    parser.add_argument(
+        "--run", type=_run_name, metavar="NAME", help="name of the run, the same for everybody (the problem's name)"
+    )
     parser.add_argument(
         "--listen", default="tcp/127.0.0.1:0", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:0)"
     )
@@ -227,6 +230,12 @@ def _network_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--wait", type=_positive, default=60.0, metavar="S", help="how long to wait for others (60)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+
+
+def _run_name(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,128}", text):  # it becomes one part of every key expression
+        raise argparse.ArgumentTypeError(f'{text!r} is not a legal name: use letters, digits, "-" and "_"')
+    return text
 
 
 def _positive(text: str) -> float:
