@@ -141,7 +141,7 @@ def _draw_modes(axes: Any, log: Log) -> None:
     else:
         here = log.mode[: log.steps - log.steps % STRETCHES].reshape(STRETCHES, -1)
         shares = [(here == s).mean(axis=1) for s in range(len(names))]
-        extent = (0, log.steps, -0.5, len(names) - 0.5)
+        extent = (0, here.size, -0.5, len(names) - 0.5)
         axes.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", aspect="auto", extent=extent)
     axes.set_ylim(-0.5, len(names) - 0.5)
     axes.set_yticks(range(len(names)), names if len(names) <= 8 else [""] * len(names))

@@ -52,7 +52,7 @@ def replay(path: FilePath) -> Verdict:
     log = load(path)
     central = Central.of(log.gains)
     tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names)
-    with np.errstate(over="ignore", invalid="ignore"):  # an absurd log may overflow: its gaps are then infinite
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
         peak = _compare(log, central, tally)
     return _verdict(log, tally, peak)
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -72,12 +73,17 @@ def load(path: Path) -> Log:
     finished = end.get("status") == "finished" and not damage
     last = max(int(topic.steps.max(initial=-1)) for topic in topics.values())
     expected = _integer(end, "steps", path=path) if finished else last + 1
-    steps, names = min(last + 1, expected), problem.node_names
-    if all(external) and not len(topics[PLANT_STATE].steps):
-        counted = [topic for topic in topics.values() if topic.topic != PLANT_STATE]  # nothing is simulated
-    else:
-        counted = list(topics.values())
-    state, estimates = topics[PLANT_STATE], [topics[estimate(name)] for name in names]
+    steps = min(last + 1, expected)
+    if finished and expected != planned:
+        content.strange.append(f"the end, it says that the run finished after {expected} of {planned} steps")
+    nothing_simulated = all(external) and not len(topics[PLANT_STATE].steps)
+    census = take_census(
+        [topic for topic in topics.values() if not (nothing_simulated and topic.topic == PLANT_STATE)],
+        steps=expected,
+        whole=finished,
+        strange=content.strange,
+        events=content.events,
+    )
     return Log(
         path=path,
         run=reader.run,
@@ -89,22 +95,30 @@ def load(path: Path) -> Log:
         planned=planned,
         steps=steps,
         messages=content.messages,
-        census=take_census(counted, steps=expected, whole=finished, strange=content.strange, events=content.events),
+        census=census,
         external=external,
         modes=content.modes,
         senders=content.senders,
-        mode=topics[MODE].words("mode", steps),
-        x=state.column("x", steps),
-        z=state.column("z", steps),
-        w=state.column("w", steps),
-        theta=state.column("arrived", steps),
-        y=np.hstack([topics[measurement(name)].column("y", steps) for name in names]),
-        innovation=np.hstack([topic.column("innovation", steps) for topic in estimates]),
-        x_hat=np.hstack([topic.column("x_hat", steps) for topic in estimates]),
-        z_hat=np.hstack([topic.column("z_hat", steps) for topic in estimates]),
-        used=np.column_stack([topic.words("mode", steps) for topic in estimates]),
-        heard=np.column_stack([topic.words("heard", steps) for topic in estimates]),
+        **_columns(topics, problem.node_names, steps),
     )
+
+
+def _columns(topics: dict[str, Topic], names: tuple[str, ...], steps: int) -> dict[str, Any]:
+    """The arrays of a Log."""
+    state, estimates = topics[PLANT_STATE], [topics[estimate(name)] for name in names]
+    return {
+        "mode": topics[MODE].words("mode", steps),
+        "x": state.column("x", steps),
+        "z": state.column("z", steps),
+        "w": state.column("w", steps),
+        "theta": state.column("arrived", steps),
+        "y": np.hstack([topics[measurement(name)].column("y", steps) for name in names]),
+        "innovation": np.hstack([topic.column("innovation", steps) for topic in estimates]),
+        "x_hat": np.hstack([topic.column("x_hat", steps) for topic in estimates]),
+        "z_hat": np.hstack([topic.column("z_hat", steps) for topic in estimates]),
+        "used": np.column_stack([topic.words("mode", steps) for topic in estimates]),
+        "heard": np.column_stack([topic.words("heard", steps) for topic in estimates]),
+    }
 
 
 class _Content:

@@ -90,8 +90,19 @@ def random_gains(problem: Problem, seed: int = 0) -> Gains:
     )
 
 
-def simulate(gains: Gains, *, steps: int, seed: int = 1, real_y: dict[str, Any] | None = None) -> list[Sent]:
-    """Every message of a lock-step run. `real_y` maps a node to (steps, ny) numbers from a real sensor."""
+def simulate(
+    gains: Gains,
+    *,
+    steps: int,
+    seed: int = 1,
+    real_y: dict[str, Any] | None = None,
+    nudge: tuple[int, str, float] | None = None,
+) -> list[Sent]:
+    """Every message of a lock-step run.
+
+    `real_y` maps a node to (steps, ny) numbers from a real sensor; `nudge` moves one node's estimate at one step,
+    and the run goes on from there.
+    """
     problem, real = gains.problem, real_y or {}
     A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
     chain, losses = schedule.modes(problem, seed=seed), schedule.Losses(problem, seed=seed)
@@ -102,6 +113,8 @@ def simulate(gains: Gains, *, steps: int, seed: int = 1, real_y: dict[str, Any] 
     sent.add("event", messages.COORDINATOR, step=0, kind="start", who="coordinator", detail="")
     for k in range(steps):
         w, theta = source.at(k), losses.at(k)
+        if nudge is not None and nudge[0] == k:
+            x_hat[nudge[1]] = x_hat[nudge[1]] + nudge[2]
         arrived = [int(arrives) for arrives in theta]
         sent.add("plant/state", messages.PLANT, step=k, x=x, z=M @ x, w=w, arrived=arrived)
         innovation = {}
@@ -162,6 +175,7 @@ def record(
     seed: int = 1,
     whole: bool = True,
     status: str = "finished",
+    end_steps: int | None = None,
     **facts: str,
 ) -> Path:
     """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`."""
@@ -171,5 +185,5 @@ def record(
             payload = canonical(message.document)
             writer.add(Logged(message.topic, payload, message.number, time, time))
         if whole:
-            writer.finish({"status": status, "reason": "", "steps": str(steps)})
+            writer.finish({"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)})
     return path if whole else path.with_name(path.name + ".part")

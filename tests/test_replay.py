@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import subprocess
 import sys
@@ -298,6 +299,17 @@ def test_an_altered_plant_state_is_found(tmp_path: Path, field: str) -> None:
     assert_found(verdict, step=8, node=None, field=f"{field}[0]")
 
 
+def test_a_jump_hidden_behind_missing_messages_is_found_by_the_free_run(tmp_path: Path) -> None:
+    """The estimates of one step are gone, and all goes on consistently from others: only proof 3 can tell."""
+    jumped = simulate(GAINS, steps=STEPS, nudge=(20, "n1", 1e-6))
+    sent = [m for m in jumped if not (m.topic.endswith("estimate") and m.document["step"] == 20)]
+    verdict = verdict_of(tmp_path, sent)
+    assert [proof.holds for proof in verdict.proofs] == [True, True, False, False, True]
+    first = verdict.first_divergence
+    assert first is not None
+    assert (first.step, first.proof) == (21, 3)
+
+
 def test_wrong_gains_are_found_by_their_digest_and_by_their_numbers(tmp_path: Path) -> None:
     other = random_gains(GAINS.problem, 9)
     path = record(tmp_path / "digest.mcap", other, TRUE, steps=STEPS, gains=GAINS.digest())
@@ -428,6 +440,41 @@ def test_messages_of_another_run_are_found(tmp_path: Path) -> None:
     verdict = verdict_of(tmp_path, [*TRUE, *other[200:230]])
     assert verdict.exit_code == 1
     assert verdict.duplicates.total == 30
+
+
+def test_a_run_shortened_afterwards_is_found(tmp_path: Path) -> None:
+    sent = [m for m in TRUE if m.document["step"] < 50 or m.topic == "event"]
+    verdict = verdict_of(tmp_path, sent, end_steps=50)
+    assert verdict.exit_code == 1
+    assert "finished after 50 of 60 steps" in verdict.text()
+    (tmp_path / "run.mcap").unlink()
+    verdict = verdict_of(tmp_path, TRUE, end_steps=50)
+    assert "the run ended after 50 steps" in verdict.text()
+
+
+@pytest.mark.parametrize("sent", [[], TRUE[:1]])
+def test_a_run_of_which_nothing_is_there_is_no_good_run(tmp_path: Path, sent: list[Sent]) -> None:
+    verdict = verdict_of(tmp_path, sent)
+    assert verdict.exit_code == 1
+    assert verdict.missing.total == 10 * STEPS
+    (tmp_path / "run.mcap").unlink()
+    assert verdict_of(tmp_path, sent, whole=False).exit_code == 3
+
+
+def test_a_run_whose_facts_make_no_sense_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'gives "1.5" for seed'):
+        verdict_of(tmp_path, TRUE, seed="1.5")
+    (tmp_path / "run.mcap").unlink()
+    with pytest.raises(InputError, match='node "n9" does not exist'):
+        verdict_of(tmp_path, TRUE, external="n9")
+
+
+def test_json_has_the_promised_keys_and_only_plain_values(tmp_path: Path) -> None:
+    promised = "agrees finished steps worst_gap tolerance first_divergence missing duplicates peak energy gamma"
+    for number, sent in enumerate((TRUE, changed("mode", 14, _other_mode), TRUE[:100], [])):
+        path = record(tmp_path / f"{number}.mcap", GAINS, sent, steps=STEPS)
+        document = json.loads(json.dumps(replay(path).document(), allow_nan=False))
+        assert set(promised.split()) <= set(document)
 
 
 # real sensors
