@@ -21,6 +21,7 @@ from designer.error_model import ErrorModel, error_model
 
 _ABOVE = 1.0 + 1e-9  # gamma stands this factor above the infimum of (18), so that (18) is strict
 _MOST_STEPS = 5000
+_GROWN = 1e100  # no stable error system of numbers that a solver takes grows so far before it shrinks
 
 
 class Confirmed(NamedTuple):
@@ -32,16 +33,13 @@ class Confirmed(NamedTuple):
     verdict: Verdict
 
 
-def back_off(problem: Problem, K_bar: Array, H_bar: Array, P: Array) -> Confirmed | None:
-    """The first P(t), from t = 0 upwards, whose gamma the check confirms; else the last one; None: none was > 0.
+def back_off(problem: Problem, K_bar: Array, H_bar: Array, P: Array) -> Confirmed:
+    """The first P(t), from t = 0 upwards, whose gamma the check confirms; if none is, the one tried last.
 
     First with P0 = diag{R0, 0}, which keeps the form diag{R, Q(s)} of Theorem 1; then with a full P0.
     """
     model = error_model(problem, K_bar, H_bar)
-    tried = None
-    for form, t, candidate in _candidates(model, P):
-        if not _positive(candidate):
-            continue
+    for form, t, candidate in _candidates(model, _lifted(P)):
         gamma = least_gamma(model.M, candidate) * _ABOVE
         tried = Confirmed(candidate, form, t, check(problem, K_bar, H_bar, P=candidate, gamma=gamma))
         if tried.verdict.holds:
@@ -69,7 +67,7 @@ def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
     term, P0 = W, W.copy()
     for _ in range(_MOST_STEPS):
         term = corner(model, term)
-        if not np.isfinite(term).all():
+        if np.abs(term).max() > _GROWN * np.abs(W).max():
             return None
         if _positive(W / 2.0 - term):
             return P0
@@ -114,6 +112,15 @@ def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:
         worst = max(worst, float(np.linalg.eigvalsh((grown + grown.T) / 2.0).max()))
     tau = t / (2.0 * worst) if worst > 0.0 else t
     return np.asarray((1.0 - t) * (P + tau * P0))
+
+
+def _lifted(P: Array) -> Array:
+    """P itself where it is positive definite, else P + shift I: a solver may leave R a rounding below 0."""
+    if all(_positive(P_s) for P_s in P):
+        return P
+    eigenvalues = np.linalg.eigvalsh(P)
+    shift = 2.0 * max(-float(eigenvalues.min()), 0.0) + 1e-9 * float(np.abs(eigenvalues).max())
+    return np.asarray(P + (shift or 1.0) * np.eye(P.shape[-1]))
 
 
 def _positive(P: Array) -> bool:

@@ -38,9 +38,7 @@ class Verdict(NamedTuple):
 def verify(gains: Gains) -> Verdict:
     """Check Theorem 1 for everything as it stands in the gains file."""
     if gains.certificate.kind != "lyapunov":
-        raise InputError(
-            f'the certificate is of kind "{gains.certificate.kind}"; this check is for kind "lyapunov"'
-        )
+        raise InputError(f'the certificate is of kind "{gains.certificate.kind}"; this check is for kind "lyapunov"')
     K_bar, H_bar = stacked_gains(gains)
     return check(gains.problem, K_bar, H_bar, P=lyapunov_matrix(gains), gamma=gains.certificate.gamma)
 
@@ -54,14 +52,11 @@ def check(problem: Problem, K_bar: Array, H_bar: Array, *, P: Array, gamma: floa
     failure = None
     for s, mode in enumerate(problem.mode_names):
         matrices = {
-            "(17)": (inequality_17(model, s, P), _allowance(inequality_17(size, s, np.abs(P), sign=1.0), size)),
-            "(18)": (
-                inequality_18(model, s, P, gamma),
-                _allowance(inequality_18(size, s, np.abs(P), gamma, sign=1.0), size),
-            ),
+            "(17)": (inequality_17(model, s, P), inequality_17(size, s, np.abs(P), sign=1.0)),
+            "(18)": (inequality_18(model, s, P, gamma), inequality_18(size, s, np.abs(P), gamma, sign=1.0)),
         }
-        for name, (S, allowance) in matrices.items():
-            positive, margin = _positive_definite(S, allowance)
+        for name, (S, magnitude) in matrices.items():
+            positive, margin = _positive_definite(S, _allowance(magnitude, problem))
             margins[f"{name} mode {mode}"] = margin
             if not positive and failure is None:
                 failure = f'inequality {name} fails in mode "{mode}": its least scaled eigenvalue is {margin:.3g}'
@@ -123,17 +118,17 @@ def _magnitudes(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     return ErrorModel(A, B, F, np.abs(model.M), model.beta, model.alpha, model.transition, nx)
 
 
-def _allowance(magnitude: Array, model: ErrorModel) -> Array:
-    """A bound on the rounding error of every entry of a computed matrix, (m, m).
+def _allowance(magnitude: Array, problem: Problem) -> Array:
+    """A bound on the rounding error of every entry of a computed matrix, (m, m), underflow aside.
 
-    An entry is a sum of products with at most `depth` roundings on the way from stored number to result: three
-    nested inner products over eta or the measurements, the sums over modes and nodes, and a few scalings. So its
-    error is at most depth u / (1 - depth u) times the same sum of absolute values. Doubled, because the
-    magnitudes are computed in floating point too.
+    An entry is a sum of products of stored numbers, with at most `depth` roundings on the way of each: in two inner
+    products over eta, in the entries of script A, B and F_i on both sides (sums over nodes and measurements), in
+    P_bar (a sum over modes) and in the sum over losses; a few scalings are in the 32. So its error is at most
+    depth u / (1 - depth u) times the same sum of absolute values: `magnitude`, which is doubled because it is
+    computed in floating point too.
     """
-    modes, n_eta = model.A.shape[:2]
-    measurements = model.F.shape[2] * model.F.shape[1]  # more than there can be roundings in H C
-    depth = 2 * n_eta + 2 * min(measurements, 4 * n_eta) + modes + model.F.shape[1] + 32
+    n, measurements = problem.n, sum(len(node.C) for node in problem.nodes)
+    depth = 2 * problem.nx * (n + 1) + 2 * (n + measurements) + len(problem.topologies) + n + 32
     return np.asarray(2.0 * depth * _U * magnitude)
 
 

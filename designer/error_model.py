@@ -40,7 +40,7 @@ class ErrorModel:
         """Script F_i of (11) in full, (n_eta, n_eta)."""
         full = np.zeros_like(self.A[s])
         full[self.plant_states :, : self.plant_states] = self.F[s, i]
-        return full
+        return np.asarray(full)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +67,12 @@ def stacks(problem: Problem) -> Stacks:
         E_i[rows, i * problem.nx : (i + 1) * problem.nx] = problem.nodes[i].C
         E.append(E_i)
     return Stacks(
-        A=np.kron(np.eye(n), plant.A),
+        A=np.asarray(np.kron(np.eye(n), plant.A), dtype=np.float64),
         B=np.tile(plant.B, (n, 1)),
         C=np.sum(E, axis=0),
         C_beta=np.sum([beta_i * E_i for beta_i, E_i in zip(beta, E, strict=True)], axis=0),
         D=np.vstack([node.D for node in problem.nodes]),
-        M=np.kron(np.eye(n), plant.M),
+        M=np.asarray(np.kron(np.eye(n), plant.M), dtype=np.float64),
         E=E,
         beta=beta,
         alpha=beta * (1.0 - beta),
@@ -87,13 +87,17 @@ def measurement_slices(problem: Problem) -> list[slice]:
 
 def rows_total(problem: Problem) -> int:
     """Number of measurements of all nodes together, sum ny."""
-    return measurement_slices(problem)[-1].stop
+    return sum(node.C.shape[0] for node in problem.nodes)
 
 
 def stacked_gains(gains: Gains) -> tuple[Array, Array]:
     """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) of (8): blocks a_ij K_ij and a_ij H_ij."""
-    problem, nx = gains.problem, gains.problem.nx
-    columns = measurement_slices(problem)
+    return stacked_links(gains.problem, gains.K, gains.H)
+
+
+def stacked_links(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> tuple[Array, Array]:
+    """`stacked_gains` of gains that are in no file yet."""
+    nx, columns = problem.nx, measurement_slices(problem)
     K_bar = np.zeros((len(problem.topologies), problem.n * nx, problem.n * nx))
     H_bar = np.zeros((len(problem.topologies), problem.n * nx, rows_total(problem)))
     for s, topology in enumerate(problem.topologies):
@@ -101,13 +105,13 @@ def stacked_gains(gains: Gains) -> tuple[Array, Array]:
             rows = slice(i * nx, (i + 1) * nx)
             for j in problem.neighbours(s, i):
                 sender, a_ij = problem.node_names[j], topology.adjacency[i, j]
-                K_bar[s, rows, j * nx : (j + 1) * nx] = a_ij * gains.K[topology.name][receiver][sender]
-                H_bar[s, rows, columns[j]] = a_ij * gains.H[topology.name][receiver][sender]
+                K_bar[s, rows, j * nx : (j + 1) * nx] = a_ij * K[topology.name][receiver][sender]
+                H_bar[s, rows, columns[j]] = a_ij * H[topology.name][receiver][sender]
     return K_bar, H_bar
 
 
 def link_gains(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[LinkMatrices, LinkMatrices]:
-    """K_ij and H_ij of (5) from the blocks of (8): the inverse of `stacked_gains`, so divided by a_ij."""
+    """K_ij and H_ij of (5) from the blocks of (8): the inverse of `stacked_links`, so divided by a_ij."""
     nx, columns = problem.nx, measurement_slices(problem)
     K: LinkMatrices = {}
     H: LinkMatrices = {}

@@ -13,8 +13,7 @@ from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.back_off import Confirmed, back_off
-from designer.certificate import Verdict
-from designer.error_model import link_gains
+from designer.error_model import link_gains, stacked_links
 from designer.lmi import LmiSolution
 
 
@@ -31,8 +30,9 @@ def design(problem: Problem, *, method: str = "theorem2") -> Gains:
     solution = METHODS[method](problem)
     solved = time.perf_counter()
     K_bar, H_bar = recover(problem, solution)
-    confirmed = _confirm(problem, K_bar, H_bar, solution)
+    _refuse_non_numbers(problem, solution, K_bar, H_bar)
     K, H = link_gains(problem, K_bar, H_bar)
+    confirmed = _confirm(problem, *stacked_links(problem, K, H), solution)  # as a reader of the file will have them
     ended = time.perf_counter()
     return Gains(
         problem=problem,
@@ -57,8 +57,8 @@ def recover(problem: Problem, solution: LmiSolution) -> tuple[Array, Array]:
         K = np.linalg.solve(Q_bar, solution.Y.reshape(modes, n, nx, -1))
         H = np.linalg.solve(Q_bar, solution.X.reshape(modes, n, nx, -1))
     except np.linalg.LinAlgError:
-        raise _unconfirmed(problem, solution, None) from None
-    return K.reshape(solution.Y.shape), H.reshape(solution.X.shape)
+        raise _unconfirmed(problem, solution, "Q_bar(s) is singular") from None
+    return np.asarray(K).reshape(solution.Y.shape), np.asarray(H).reshape(solution.X.shape)
 
 
 def block_diagonal(R: Array, Q: Array) -> Array:
@@ -72,17 +72,19 @@ def block_diagonal(R: Array, Q: Array) -> Array:
 
 
 def _confirm(problem: Problem, K_bar: Array, H_bar: Array, solution: LmiSolution) -> Confirmed:
-    """What the check says of the gains as a file will hold them, or Unattainable."""
-    if not (np.isfinite(K_bar).all() and np.isfinite(H_bar).all() and math.isfinite(solution.gamma)):
-        raise _unconfirmed(problem, solution, None)
+    """The gains' P and gamma, backed off until the check confirms them; or Unattainable."""
     confirmed = back_off(problem, K_bar, H_bar, block_diagonal(solution.R, solution.Q))
-    if confirmed is None or not confirmed.verdict.holds:
-        raise _unconfirmed(problem, solution, confirmed.verdict if confirmed else None)
+    if not confirmed.verdict.holds:
+        raise _unconfirmed(problem, solution, confirmed.verdict.failure)
     return confirmed
 
 
-def _unconfirmed(problem: Problem, solution: LmiSolution, verdict: Verdict | None) -> Unattainable:
-    why = (verdict and verdict.failure) or "P is not positive definite"
+def _refuse_non_numbers(problem: Problem, solution: LmiSolution, K_bar: Array, H_bar: Array) -> None:
+    if not (np.isfinite(K_bar).all() and np.isfinite(H_bar).all() and math.isfinite(solution.gamma)):
+        raise _unconfirmed(problem, solution, "some of its numbers are not finite")
+
+
+def _unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Unattainable:
     return Unattainable(
         f"{solution.solver.name} says {solution.solver.status} with gamma {solution.gamma:.6g} for {problem.name}, "
         f"but the check without a solver does not confirm its answer ({why}); "

@@ -50,13 +50,13 @@ def solve(problem: Problem, *, reduced: bool = False) -> LmiSolution:
     Clarabel first; if it gives no answer, Clarabel on rescaled data, then SCS where it is installed. What
     failed on the way stands in `solver.status`. Raises Unattainable: infeasible, or no solver had an answer.
     """
-    own, natural = Units(np.ones(problem.nx), 1.0), natural_units(problem)
-    attempts = [(cp.CLARABEL, own, ""), (cp.CLARABEL, natural, " on rescaled data")]
-    if cp.SCS in cp.installed_solvers():
-        attempts.append((cp.SCS, natural, " on rescaled data"))
+    attempts = [(cp.CLARABEL, ""), (cp.CLARABEL, " on rescaled data"), (cp.SCS, " on rescaled data")]
     failures: list[str] = []
-    for solver, units, remark in attempts:
-        lmi = theorem2(problem if units is own else rescaled(problem, units), reduced=reduced)
+    for solver, remark in attempts:
+        if solver not in cp.installed_solvers():
+            continue
+        units = natural_units(problem) if remark else Units(np.ones(problem.nx), 1.0)
+        lmi = theorem2(rescaled(problem, units), reduced=reduced)
         status, seconds = _run(lmi.problem, solver)
         if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE):
             raise Unattainable(
@@ -94,9 +94,7 @@ def theorem2(problem: Problem, *, reduced: bool = False) -> Lmi:
     constraints = []
     for s in range(modes):
         Q_s = _diag(Q[s])
-        Q_bar = _diag(
-            [sum(problem.markov.transition[s, t] * Q[t][i] for t in range(modes)) for i in range(n)]
-        )
+        Q_bar = _diag([sum(problem.markov.transition[s, t] * Q[t][i] for t in range(modes)) for i in range(n)])
         kept = _rows_that_matter(problem, s, len(J.T))
         constraints.append(inequality_36(bar, J, R, Q_s, Q_bar, X[s], Y[s])[kept][:, kept] << 0)
         constraints.append(inequality_37(bar, R, Q_s, delta) << 0)
@@ -184,9 +182,7 @@ def _sparse(problem: Problem, s: int, widths: Sequence[int]) -> Any:
     rows = []
     for i in range(problem.n):
         heard = problem.neighbours(s, i)
-        rows.append(
-            [cp.Variable((nx, q)) if j in heard else np.zeros((nx, q)) for j, q in enumerate(widths)]
-        )
+        rows.append([cp.Variable((nx, q)) if j in heard else np.zeros((nx, q)) for j, q in enumerate(widths)])
     return cp.bmat(rows)
 
 

@@ -1,0 +1,68 @@
+"""Small random problems and gains for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.problem import Problem
+
+
+def random_problem(
+    seed: int, *, n: int = 3, nx: int = 2, nw: int = 2, nz: int = 1, modes: int = 2, lossy: bool = True
+) -> Problem:
+    """A stable plant, nodes with one or two measurements each, weights other than 1, node 1 without loss."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(nx, nx))
+    A *= 0.8 / np.abs(np.linalg.eigvals(A)).max()
+    transition = rng.uniform(0.1, 1.0, size=(modes, modes))
+    transition /= transition.sum(axis=1, keepdims=True)
+    document: dict[str, Any] = {
+        "name": f"random-{seed}",
+        "plant": {
+            "A": A.tolist(),
+            "B": rng.normal(size=(nx, nw)).tolist(),
+            "M": rng.normal(size=(nz, nx)).tolist(),
+        },
+        "node": [
+            {
+                "name": f"n{i}",
+                "C": rng.normal(size=(1 + i % 2, nx)).tolist(),
+                "D": rng.normal(size=(1 + i % 2, nw)).tolist(),
+                "arrival_probability": float(rng.uniform(0.5, 0.95)) if lossy and i else 1.0,
+            }
+            for i in range(n)
+        ],
+        "topology": [{"name": f"m{s}", "adjacency": _adjacency(rng, n).tolist()} for s in range(modes)],
+        "markov": {"transition": transition.tolist(), "initial": "m0"},
+    }
+    return Problem.from_document(document)
+
+
+def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Array, Array]:
+    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) with the sparsity of (9)."""
+    rng = np.random.default_rng(seed)
+    K_bar, H_bar = [], []
+    for s in range(len(problem.topologies)):
+        K_rows, H_rows = [], []
+        for i in range(problem.n):
+            heard = problem.neighbours(s, i)
+            K_rows.append([_block(rng, problem.nx, problem.nx, j in heard, size) for j in range(problem.n)])
+            H_rows.append(
+                [_block(rng, problem.nx, len(node.C), j in heard, size) for j, node in enumerate(problem.nodes)]
+            )
+        K_bar.append(np.block(K_rows))
+        H_bar.append(np.block(H_rows))
+    return np.array(K_bar), np.array(H_bar)
+
+
+def _block(rng: np.random.Generator, rows: int, columns: int, heard: bool, size: float) -> Array:
+    return size * rng.normal(size=(rows, columns)) if heard else np.zeros((rows, columns))
+
+
+def _adjacency(rng: np.random.Generator, n: int) -> Array:
+    adjacency = np.where(rng.uniform(size=(n, n)) < 0.5, rng.uniform(0.3, 2.0, size=(n, n)), 0.0)
+    np.fill_diagonal(adjacency, rng.uniform(0.5, 1.5, size=n))
+    return np.asarray(adjacency)

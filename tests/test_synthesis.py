@@ -1,0 +1,93 @@
+"""From a problem to gains with a gamma that is confirmed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agent.contract.errors import InputError, Unattainable
+from agent.contract.gains import Solver
+from agent.contract.problem import Problem
+from designer import synthesis
+from designer.certificate import verify
+from designer.lmi import LmiSolution
+from designer.problems import find
+from designer.synthesis import METHODS, design
+from networks import random_problem
+
+SOLVER = Solver(name="made up", version="0", status="optimal_inaccurate", iterations=1, seconds=0.0)
+
+
+@pytest.mark.parametrize("name", ["zhu2020-ideal", "zhu2020-lossy"])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_papers_examples_are_confirmed_close_to_the_optimum(name: str, method: str) -> None:
+    """The stored gamma holds by the check without a solver, and lies within 1e-4 of the LMI's optimum."""
+    gains = design(find(name), method=method)
+    proved = gains.certificate
+    assert proved.holds
+    assert verify(gains).holds
+    assert proved.lmi_gamma is not None
+    assert proved.gamma == pytest.approx(proved.lmi_gamma, rel=1e-4)
+    assert gains.seconds["total"] >= gains.seconds["solve"] > 0.0
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        random_problem(11),
+        random_problem(12, n=1, modes=1),
+        random_problem(13, n=4, nx=1, nw=3, nz=2, modes=1),
+        random_problem(14, n=2, nx=3, modes=3, lossy=False),
+    ],
+    ids=["weights", "one-node-one-mode", "one-mode", "no-loss"],
+)
+def test_random_networks_are_confirmed(problem: Problem) -> None:
+    """Different numbers of measurements, weights, one node, one mode, several disturbances: gains that hold."""
+    gains = design(problem, method="theorem2-reduced")
+    assert verify(gains).holds
+    assert gains.certificate.gamma == pytest.approx(gains.certificate.lmi_gamma, rel=1e-3)
+
+
+def test_a_node_gets_gains_only_from_nodes_that_it_hears() -> None:
+    """K and H have the sparsity (9)."""
+    gains = design(find("zhu2020-lossy"), method="theorem2-reduced")
+    assert set(gains.K["1"]["2"]) == {"2"}
+    assert set(gains.H["3"]["1"]) == {"1", "2", "4"}
+
+
+def test_an_unknown_method_lists_the_methods() -> None:
+    """A wrong method is bad input, answered before anything is solved."""
+    with pytest.raises(InputError, match='"magic" does not exist; the methods are "theorem2"'):
+        design(find("two-nodes"), method="magic")
+
+
+def test_nothing_to_estimate_is_refused() -> None:
+    """M = 0 is bad input: no gamma > 0 would mean anything."""
+    document = find("two-nodes").document()
+    document["plant"]["M"] = [[0.0]]
+    with pytest.raises(InputError, match="M is zero"):
+        design(Problem.from_document(document))
+
+
+@pytest.mark.parametrize("bad", ["zero", "unstable", "not-a-number"])
+def test_an_answer_that_the_check_does_not_confirm_is_refused(bad: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """optimal_inaccurate passes only if the check does; otherwise Unattainable names status, reason and advice."""
+    Q = {
+        "zero": np.zeros((1, 2, 1, 1)),
+        "unstable": np.ones((1, 2, 1, 1)),
+        "not-a-number": np.full((1, 2, 1, 1), np.nan),
+    }
+    wrong = LmiSolution(1.0, np.eye(1), Q[bad], np.ones((1, 2, 2)), 3.0 * np.ones((1, 2, 2)), SOLVER)
+    monkeypatch.setitem(synthesis.METHODS, "wrong", lambda problem: wrong)
+    with pytest.raises(Unattainable, match="made up says optimal_inaccurate .*does not confirm.*; try"):
+        design(find("two-nodes"), method="wrong")
+
+
+def test_an_inaccurate_answer_is_backed_off_until_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A P that is a little too large for (17) is lowered, gamma rises by as much, and what is stored holds."""
+    exact = METHODS["theorem2-reduced"](find("two-nodes"))
+    rough = exact._replace(R=1.00001 * exact.R, Q=1.00001 * exact.Q, X=1.00001 * exact.X, Y=1.00001 * exact.Y)
+    monkeypatch.setitem(synthesis.METHODS, "rough", lambda problem: rough)
+    gains = design(find("two-nodes"), method="rough")
+    assert verify(gains).holds
+    assert np.sqrt(2.0) < gains.certificate.gamma < np.sqrt(2.0) * (1.0 + 1e-4)
