@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 from types import FrameType, TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -40,10 +41,9 @@ from agent.contract.messages import (
     replay,
     topic_of,
 )
-from agent.mailbox import Mailbox
 
 LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
-COORDINATOR_LOST = "the coordinator was lost: its process ended, or the network to it failed"
+CAPACITY = 8192  # messages that a channel holds; far more than a window lets come
 CLOSE_SECONDS = 1.5  # how long a leaving participant waits for the recorder's last word
 
 
@@ -57,12 +57,11 @@ class Network:
 
 
 class Sample(NamedTuple):
-    """A data message as it came in. `stamp` is None where the sender left it out; `time` is in ns."""
+    """A data message as it came in. `stamp` is None where the sender left it out."""
 
     topic: str
     payload: bytes
     stamp: Stamp | None
-    time: int
 
 
 class Peer(NamedTuple):
@@ -78,23 +77,8 @@ class Replayed(NamedTuple):
     who: str
 
 
-class Signal(NamedTuple):
-    """SIGINT or SIGTERM."""
-
-    number: int
-
-
-class Raw(NamedTuple):
-    """What a callback enqueues: decoded by the main thread, so that a failure ends the process."""
-
-    decode: Callable[[Raw], Incoming]
-    topic: str
-    content: Any
-    time: int
-
-
-T = TypeVar("T")
 Incoming = Sample | Peer | Control | Acknowledged | Ready | Replayed
+T = TypeVar("T")
 
 
 class RunClosed(Exception):
@@ -105,52 +89,81 @@ class RunClosed(Exception):
         self.control = control
 
 
+class ChannelClosed(Exception):
+    """Raised by `Channel.next` when this participant leaves."""
+
+
+class Channel:
+    """A topic's messages, in order. They wait in zenoh, without running any Python, until they are asked for."""
+
+    def __init__(self, topic: str, handler: Any) -> None:
+        self._topic, self._handler = topic, handler
+
+    def next(self) -> Sample:
+        """The next message; blocks until there is one. Raises ChannelClosed."""
+        try:
+            return _sample(self._topic, self._handler.recv())
+        except zenoh.ZError:
+            raise ChannelClosed from None
+
+    def waiting(self) -> Iterator[Sample]:
+        """The messages that are there already; does not block."""
+        while (sample := self._handler.try_recv()) is not None:
+            yield _sample(self._topic, sample)
+
+
 class Bus:
-    """A zenoh session that belongs to participant `who` of run `run`. Use it with `with`."""
+    """A zenoh session that belongs to participant `who` of run `run`. Use it with `with`.
+
+    One thread may publish and take from channels; everything else belongs to the main thread.
+    """
 
     def __init__(self, network: Network, *, run: str, who: str) -> None:
         self.run, self.who, self.network = run, who, network
-        self._mailbox = Mailbox()
+        self._queue: SimpleQueue[Callable[[], Incoming | None]] = SimpleQueue()  # what the main thread has to do
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._kept: deque[tuple[Stamp, str, bytes]] = deque()  # what the recorder has not acknowledged
         self._published = 0
-        self._alone = True
-        self._last_word: Acknowledged | None = None  # that the recording is closed
-        self._recorder_gone = False
-        self._ending: Exception | None = None  # how the run ended for us
         self._early: list[Incoming] = []  # what came while we waited for something else
+        self._alone = True
+        self._present: set[str] = set()  # whose token is there
+        self._last_word: Acknowledged | None = None  # that the recording is closed
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         self._session = _open(network)
 
     # Declare: first what we receive, then what we send, the token last.
-    def subscribe(self, topics: Iterable[str]) -> None:
-        """Receive these topics' messages."""
-        for topic in topics:
-            self._listen(topic, _sample)
+    def channel(self, topic: str) -> Channel:
+        """Receive a topic's messages."""
+        subscriber = self._session.declare_subscriber(key(self.run, topic), zenoh.handlers.FifoChannel(CAPACITY))
+        self._declared.append(subscriber)
+        return Channel(topic, subscriber.handler)
 
     def advertise(self, topics: Iterable[str]) -> None:
         """Announce that these topics will be published, and offer replays of them."""
-        queries = _direct(lambda query: self._mailbox.put_urgent(query))
-        self._declared.append(self._session.declare_queryable(key(self.run, replay(self.who)), queries))
+        queries = self._session.declare_queryable(
+            key(self.run, replay(self.who)), lambda query: self._queue.put(lambda: self._replay(query))
+        )
+        self._declared.append(queries)
         for topic in topics:
             self._publishers[topic] = self._session.declare_publisher(
-                key(self.run, topic), congestion_control=zenoh.CongestionControl.BLOCK
+                key(self.run, topic),
+                congestion_control=zenoh.CongestionControl.BLOCK,  # the default drops without a word
+                express=topic.endswith("/estimate"),  # the only message that somebody waits for right now
             )
 
     def enter(self) -> None:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
         if self.who == COORDINATOR:
-            self._listen(ready("*"), lambda raw: Ready.model_validate_json(_payload(raw)))
+            self._listen(ready("*"), Ready)
         else:
-            self._listen(CONTROL, lambda raw: Control.model_validate_json(_payload(raw)), urgent=True)
+            self._listen(CONTROL, Control)
         if self.who != RECORDER:
-            self._listen(ACKNOWLEDGED, lambda raw: Acknowledged.model_validate_json(_payload(raw)))
+            self._listen(ACKNOWLEDGED, Acknowledged)
         liveliness = self._session.liveliness()
-        tokens = key(self.run, alive("*"))
-        watch = self._enqueue(tokens, _peer, urgent=True)
-        self._declared.append(liveliness.declare_subscriber(tokens, watch, history=True))
+        watch = liveliness.declare_subscriber(key(self.run, alive("*")), self._on_token, history=True)
+        self._declared.append(watch)
         self._declared.append(liveliness.declare_token(key(self.run, alive(self.who))))
 
     # Start together.
@@ -159,9 +172,8 @@ class Bus:
         absent = set(others) - {self.who}
         deadline = time.monotonic() + self.network.wait
         while absent:
-            for item in self._wait_for(Peer, deadline=deadline, missing=absent):
-                if item.present:
-                    absent.discard(item.who)
+            peer = self._wait_for(Peer, deadline=deadline, missing=absent)
+            absent.discard(peer.who)
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
         """The coordinator's: wait until everybody has met everybody."""
@@ -169,9 +181,9 @@ class Bus:
         unready = set(others) - {self.who}
         deadline = time.monotonic() + self.network.wait
         while unready:
-            for item in self._wait_for(Ready, deadline=deadline, missing=unready):
-                answers[item.who] = item
-                unready.discard(item.who)
+            answer = self._wait_for(Ready, deadline=deadline, missing=unready)
+            answers[answer.who] = answer
+            unready.discard(answer.who)
         return answers
 
     def report_ready(self, gains: str) -> None:
@@ -181,7 +193,7 @@ class Bus:
     def wait_for_start(self) -> Control:
         """The coordinator's order to start, with the facts of the run."""
         deadline = time.monotonic() + self.network.wait
-        return self._wait_for(Control, deadline=deadline, missing={COORDINATOR})[0]
+        return self._wait_for(Control, deadline=deadline, missing={COORDINATOR})
 
     # Run.
     def publish(self, topic: str, message: Message) -> None:
@@ -192,23 +204,26 @@ class Bus:
         self._kept.append((stamp, topic, payload))
         self._publishers[topic].put(payload, attachment=stamp.encode())
 
-    def receive(self, wanted: int = 1, *, timeout: float = math.inf) -> list[Incoming]:
-        """Messages, once `wanted` are there; fewer where something urgent came or `timeout` has passed.
+    def receive(self, *, timeout: float = math.inf) -> Incoming | None:
+        """The next word for the main thread; None where `timeout` seconds have passed.
 
-        Raises RunClosed when the coordinator ends the run, RunBroken when the coordinator is lost, and
-        Interrupted on a signal; what came before is returned first.
+        Raises RunClosed when the coordinator ends the run, RunBroken when the coordinator is lost, Interrupted
+        on a signal, and whatever was given to `fail`.
         """
-        if not self._early and self._ending is None:
-            self._early = self._take(wanted, timeout=timeout)
-        if not self._early and self._ending is not None:
-            raise self._ending
-        items, self._early = self._early, []
-        for item in items:
-            if isinstance(item, Control):
-                self._ending = self._ending or RunClosed(item)
-            if isinstance(item, Peer) and not item.present and item.who == COORDINATOR:
-                self._ending = self._ending or RunBroken(COORDINATOR_LOST)
-        return items
+        deadline = time.monotonic() + timeout
+        while True:
+            item = self._early.pop(0) if self._early else self._take(deadline)
+            match item:
+                case Control():
+                    raise RunClosed(item)
+                case Peer(who="coordinator", present=False):
+                    raise RunBroken("the coordinator was lost: its process ended, or the network to it failed")
+            if item is not None or time.monotonic() >= deadline:
+                return item
+
+    def fail(self, error: BaseException) -> None:
+        """Have the main thread raise `error`; called by the thread that computes."""
+        self._queue.put(lambda: _raise(error))
 
     def order(self, control: Control) -> None:
         """The coordinator's word to everybody."""
@@ -219,35 +234,43 @@ class Bus:
         self._put(ACKNOWLEDGED, acknowledged)
 
     def request_replay(self, who: str, *, first: int) -> None:
-        """Ask `who` for its messages from number `first` on: they come in as samples, then Replayed(who)."""
-        put, done = self._enqueue("", _reply), Raw(lambda _: Replayed(who), "", None, 0)
-        answers = zenoh.handlers.Callback(put.callback, lambda: self._mailbox.put(done))
+        """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
+
+        def answer(reply: zenoh.Reply) -> None:
+            self._queue.put(lambda: _replayed(reply))
+
         self._session.get(
             f"{key(self.run, replay(who))}?from={first}",
-            answers,
+            zenoh.handlers.Callback(answer, lambda: self._queue.put(lambda: Replayed(who))),
             consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=CLOSE_SECONDS,
         )
 
+    # End together.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
-        """The samples that are still to come, until everybody in `whos` has answered a request for replay."""
+        """Samples that are still to come, until everybody in `whos` has answered a request for replay."""
         waiting = set(whos)
         deadline = time.monotonic() + CLOSE_SECONDS
         while waiting and time.monotonic() < deadline:
-            for item in self._take(1, timeout=deadline - time.monotonic()):
-                if isinstance(item, Sample):
-                    yield item
-                elif isinstance(item, Replayed):
-                    waiting.discard(item.who)
+            match self._take(deadline):
+                case Sample() as sample:
+                    yield sample
+                case Replayed(who=who):
+                    waiting.discard(who)
 
-    # End together.
     def wait_for_close(self, timeout: float = CLOSE_SECONDS) -> Acknowledged | None:
         """Answer replays until the recorder has closed the recording; None where it did not say so in time."""
         deadline = time.monotonic() + timeout
-        while self._last_word is None and not self._recorder_gone and time.monotonic() < deadline:
-            self._take(1, timeout=deadline - time.monotonic())
+        while self._last_word is None and RECORDER in self._present and time.monotonic() < deadline:
+            self._take(deadline)
         return self._last_word
+
+    def wait_for_leave(self, who: str) -> None:
+        """Stay until `who` has gone, so that our last word is sure to reach them; not for longer than a moment."""
+        deadline = time.monotonic() + CLOSE_SECONDS
+        while who in self._present and time.monotonic() < deadline:
+            self._take(deadline)
 
     def locators(self) -> list[str]:
         """The addresses at which this session can be reached."""
@@ -267,45 +290,47 @@ class Bus:
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
 
     # Inside.
-    def _take(self, wanted: int, *, timeout: float) -> list[Incoming]:
-        """What came in, decoded; replays are answered and acknowledgements heeded on the way."""
-        passed_on: list[Incoming] = []
-        for item in self._mailbox.take(wanted, timeout=timeout):
-            if isinstance(item, Signal):
-                self._ending = self._ending or Interrupted(item.number)
-                continue
-            if isinstance(item, zenoh.Query):
-                self._replay(item)
-                continue
-            decoded = item.decode(item)
-            if isinstance(decoded, Acknowledged):
-                self._forget(decoded.received.get(self.who, 0))
-                self._last_word = decoded if decoded.closed else None
-            if isinstance(decoded, Peer) and decoded.who == RECORDER:
-                self._recorder_gone = not decoded.present
-            passed_on.append(decoded)
-        return passed_on
+    def _take(self, deadline: float) -> Incoming | None:
+        """The next word; None at the deadline, or where it was dealt with here: a replay, an acknowledgement."""
+        left = deadline - time.monotonic()
+        item: Incoming | None
+        try:
+            item = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
+        except Empty:
+            return None
+        if item is not None:
+            self._alone = False
+        match item:
+            case Acknowledged(received=received, closed=closed):
+                while self._kept and self._kept[0][0].number < received.get(self.who, 0):
+                    self._kept.popleft()
+                self._last_word = item if closed else None
+            case Peer(who=who, present=True):
+                self._present.add(who)
+            case Peer(who=who):
+                self._present.discard(who)
+        return item
 
-    def _wait_for(self, kind: type[T], *, deadline: float, missing: set[str]) -> list[T]:
-        """Items of one kind, at least one; what else comes is kept for `receive`."""
-        found: list[T] = []
-        while not found:
-            items = self._take(1, timeout=deadline - time.monotonic())
-            if self._ending is not None:
-                raise self._ending
-            if not items and time.monotonic() >= deadline:
-                raise RunBroken(self._who_is_missing(missing))
-            for item in items:
-                self._alone = False
-                if isinstance(item, Control) and item.order != "start":
+    def _wait_for(self, kind: type[T], *, deadline: float, missing: set[str]) -> T:
+        """The next word of one kind; what else comes is kept for `receive`."""
+        for item in self._early:
+            if isinstance(item, kind):
+                self._early.remove(item)
+                return item
+        while True:
+            item = self._take(deadline)
+            if item is None:
+                if time.monotonic() >= deadline:
+                    raise RunBroken(self._who_is_missing(missing))
+                continue
+            match item:
+                case Control(order="close" | "stop"):
                     raise RunClosed(item)
-                if isinstance(item, Peer) and not item.present:
-                    raise RunBroken(f"{in_words(item.who)} left before the run had started")
-                if isinstance(item, kind):
-                    found.append(item)
-                else:
-                    self._early.append(item)
-        return found
+                case Peer(who=who, present=False):
+                    raise RunBroken(f"{in_words(who)} left before the run had started")
+            if isinstance(item, kind):
+                return item
+            self._early.append(item)
 
     def _who_is_missing(self, missing: set[str]) -> str:
         if self._alone and self.network.connect:
@@ -314,60 +339,44 @@ class Bus:
         names = " and ".join(map(in_words, sorted(missing)))
         return f"{names} did not join the run within {self.network.wait:g} s"
 
-    def _forget(self, received: int) -> None:
-        while self._kept and self._kept[0][0].number < received:
-            self._kept.popleft()
-
     def _replay(self, query: zenoh.Query) -> None:
         first = int(query.parameters.get("from") or 0)
         with query:
-            for stamp, topic, payload in self._kept:
+            for stamp, topic, payload in tuple(self._kept):
                 if stamp.number >= first:
                     query.reply(key(self.run, topic), payload, attachment=stamp.encode())
 
-    def _listen(self, topic: str, decode: Callable[[Raw], Incoming], *, urgent: bool = False) -> None:
-        callback = self._enqueue(topic, decode, urgent=urgent)
-        self._declared.append(self._session.declare_subscriber(key(self.run, topic), callback))
+    def _listen(self, topic: str, model: type[Control] | type[Acknowledged] | type[Ready]) -> None:
+        def enqueue(sample: zenoh.Sample) -> None:  # on zenoh's thread; decoded on ours, where a failure is seen
+            self._queue.put(lambda: model.model_validate_json(sample.payload.to_bytes()))
 
-    def _enqueue(self, topic: str, decode: Callable[[Raw], Incoming], *, urgent: bool = False) -> Any:
-        """A callback for zenoh's threads: it only enqueues."""
-        put = self._mailbox.put_urgent if urgent else self._mailbox.put
-        return _direct(lambda content: put(Raw(decode, topic, content, time.time_ns())))
+        self._declared.append(self._session.declare_subscriber(key(self.run, topic), enqueue))
 
     def _put(self, topic: str, content: Control | Acknowledged | Ready) -> None:
         payload = content.model_dump_json().encode()
         self._session.put(key(self.run, topic), payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        who = topic_of(str(sample.key_expr)).removeprefix(alive(""))
+        self._queue.put(lambda: Peer(who, sample.kind == zenoh.SampleKind.PUT))
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._mailbox.put_urgent(Signal(number))
+        self._queue.put(lambda: _raise(Interrupted(number)))
 
 
-def _direct(callback: Callable[[Any], None]) -> Any:
-    """Call back on the thread that receives, without a Python thread in between."""
-    return zenoh.handlers.Callback(callback, indirect=False)
+def _raise(error: BaseException) -> None:
+    raise error
 
 
-def _payload(raw: Raw) -> bytes:
-    return bytes(raw.content.payload.to_bytes())
+def _sample(topic: str, sample: zenoh.Sample) -> Sample:
+    attachment = sample.attachment
+    stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    return Sample(topic, sample.payload.to_bytes(), stamp)
 
 
-def _sample(raw: Raw) -> Sample:
-    attachment = raw.content.attachment
-    try:
-        stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
-    except ValueError as error:
-        raise RunBroken(f"a message on {raw.topic} has no readable stamp: {error}") from None
-    return Sample(raw.topic, raw.content.payload.to_bytes(), stamp, raw.time)
-
-
-def _reply(raw: Raw) -> Sample:
-    sample = raw.content.ok
-    return _sample(raw._replace(topic=topic_of(str(sample.key_expr)), content=sample))
-
-
-def _peer(raw: Raw) -> Peer:
-    who = topic_of(str(raw.content.key_expr)).removeprefix(alive(""))
-    return Peer(who, raw.content.kind == zenoh.SampleKind.PUT)
+def _replayed(reply: zenoh.Reply) -> Sample | None:
+    sample = reply.ok
+    return _sample(topic_of(str(sample.key_expr)), sample) if sample is not None else None
 
 
 def _open(network: Network) -> zenoh.Session:

@@ -168,10 +168,9 @@ def recorder_command(options: argparse.Namespace) -> int:
 
 def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
     from agent.bus import Bus
-    from agent.roles.joining import take_part
 
     with Bus(_network(options), run=options.run or gains.problem.name, who=who) as bus:
-        take_part(bus, lambda: role(bus))
+        role(bus)
     return EXIT_GOOD
 
 

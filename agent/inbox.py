@@ -56,8 +56,8 @@ class Inbox:
                 self._pairs[step][sender] = Pair(np.array(x_hat), np.array(innovation))
 
     @property
-    def measurement(self) -> Array | None:
-        """y_i of the present step, None while it is missing."""
+    def y(self) -> Array | None:
+        """The measurement of the present step, None while it is missing."""
         return self._measurements.get(self._step)
 
     @property
@@ -66,13 +66,10 @@ class Inbox:
         return self._modes.get(self._step)
 
     @property
-    def lacking(self) -> int:
-        """How many messages the present step still waits for, at least."""
-        mode = self._modes.get(self._step)
-        if mode is None:
-            return 1
+    def lacking(self) -> str | None:
+        """A node whose pair the present step's mode asks for and that is missing; None where all are there."""
         pairs = self._pairs[self._step]
-        return sum(sender not in pairs for sender in self._hears[mode])
+        return next((sender for sender in self._hears[self._modes[self._step]] if sender not in pairs), None)
 
     @property
     def heard(self) -> dict[str, Pair]:

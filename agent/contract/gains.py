@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 from agent.contract.arrays import Array, Matrix, Model, shape_text
 from agent.contract.errors import InputError, first_fault, listed
 from agent.contract.files import read_bytes, write_whole
-from agent.contract.problem import Problem
+from agent.contract.problem import Number, Problem
 
 FORMAT = "peakmesh-gains"
 VERSION = 1
@@ -37,19 +37,19 @@ class Certificate(Model):
     eta = [x; e_1; ...; e_n], nodes in file order, of length nx (n + 1).
     """
 
-    gamma: float = Field(gt=0.0)
+    gamma: Number = Field(gt=0.0)
     kind: Literal["lyapunov", "exact"]
     form: Literal["structured", "full"]
     R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx)
     Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]
     P: dict[str, Matrix] | None = None  # full: P[mode]
     horizon: int | None = None  # of the exact gain
-    lmi_gamma: float | None = None  # where an LMI was solved: its optimum, as the solver gave it
-    exact: tuple[float, float] | None = None  # the gain lies between these
-    floor: float | None = None
-    holds: bool
+    lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
+    exact: tuple[Number, Number] | None = None  # the gain lies between these
+    floor: Number | None = None
+    holds: bool = Field(strict=True)
     verified: str  # what was verified, and how
-    margins: dict[str, float]  # by how much each inequality holds; all positive where it does
+    margins: dict[str, Number]  # by how much each inequality holds; all positive where it does
 
 
 class Gains(Model):
@@ -64,7 +64,7 @@ class Gains(Model):
     H: LinkMatrices  # each (nx, ny_j)
     certificate: Certificate
     solver: Solver
-    seconds: dict[str, float]  # of each phase of the design, and "total"
+    seconds: dict[str, Number]  # of each phase of the design, and "total"
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -152,12 +152,12 @@ class Conductor:
         while self.complete == before:
             if time.monotonic() >= deadline:
                 raise RunBroken(self._what_is_late(recorder_speaks))
-            for item in self._bus.receive(timeout=deadline - time.monotonic()):
-                if isinstance(item, Acknowledged):
-                    self.complete, self._lacking = item.steps, item.lacking
+            match self._bus.receive(timeout=deadline - time.monotonic()):
+                case Acknowledged(steps=steps, lacking=lacking):
+                    self.complete, self._lacking = steps, lacking
                     recorder_speaks = True
-                elif isinstance(item, Peer) and not item.present:
-                    raise Lost(item.who)
+                case Peer(who=who, present=False):
+                    raise Lost(who)
         if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._report({"complete": self.complete})

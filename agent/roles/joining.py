@@ -1,10 +1,11 @@
-"""How every participant but the coordinator joins a run, and how it leaves."""
+"""How every participant but the coordinator joins a run, and how the publishers take part and leave."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
-from agent.bus import Bus, RunClosed
+from agent.bus import Bus, ChannelClosed, RunClosed
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import Control, participants
@@ -18,13 +19,26 @@ def join(bus: Bus, gains: Gains) -> Control:
     return bus.wait_for_start()
 
 
-def take_part(bus: Bus, role: Callable[[], None]) -> None:
-    """Run a publisher's role, and stay until the recorder has closed the recording.
+def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
+    """Join, do `work` in a thread of its own until the coordinator ends the run, stay until all is recorded.
 
-    Raises RunBroken where the run was stopped, or may lack something.
+    Meanwhile the main thread answers replays and watches for the end. Raises RunBroken where the run was stopped
+    or may lack something, and whatever `work` raises.
     """
+    start = join(bus, gains)
+
+    def guarded() -> None:
+        try:
+            work(start)
+        except ChannelClosed:
+            return
+        except Exception as error:
+            bus.fail(error)
+
+    threading.Thread(target=guarded, daemon=True, name="work").start()
     try:
-        role()
+        while True:
+            bus.receive()
     except RunClosed as closed:
         last_word = bus.wait_for_close()
         if closed.control.order == "stop":

@@ -2,65 +2,74 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 from pydantic import ValidationError
 
-from agent.bus import Bus, Incoming, Sample
-from agent.contract.errors import RunBroken
-from agent.contract.gains import Gains
-from agent.contract.messages import MODE, Estimate, estimate, measurement, model_of
-from agent.filter import Pair, innovation, step
+from agent.bus import Bus, Sample
+from agent.contract.arrays import Array
+from agent.contract.errors import RunBroken, first_fault
+from agent.contract.gains import Gains, NodeGains
+from agent.contract.messages import MODE, Control, Estimate, estimate, measurement, model_of
+from agent.filter import innovation, step
 from agent.inbox import Inbox
-from agent.roles.joining import join
+from agent.roles.joining import take_part
 
 
 def run(bus: Bus, gains: Gains, *, node: str) -> None:
-    """Take part as node `node` until the run is closed (Bus.receive raises RunClosed)."""
-    own = gains.for_node(node)
-    inbox = Inbox(own)
-    problem = gains.problem
-    heard = [problem.node_names[j] for j in problem.ever_heard(problem.node_index(node))]
-    bus.subscribe([MODE, measurement(node), *(estimate(sender) for sender in heard if sender != node)])
+    """Take part as node `node` until the run has ended."""
+    problem, own = gains.problem, gains.for_node(node)
+    senders = [problem.node_names[j] for j in problem.ever_heard(problem.node_index(node))]
+    modes, measurements = bus.channel(MODE), bus.channel(measurement(node))
+    estimates = {sender: bus.channel(estimate(sender)) for sender in senders if sender != node}
     bus.advertise([estimate(node)])
-    join(bus, gains)
 
-    k = 0
-    x_hat = np.zeros(problem.nx)
-    made_by: tuple[str, list[str]] = ("", [])  # the mode and the senders that made x_hat
-    while True:
-        while (y := inbox.measurement) is None:
-            _take_in(inbox, bus.receive())
-        pair = Pair(x_hat, innovation(own, y, x_hat))
-        try:
-            sent = Estimate(
-                step=k,
-                x_hat=pair.x_hat.tolist(),
-                innovation=pair.innovation.tolist(),
-                z_hat=(own.M @ x_hat).tolist(),
-                mode=made_by[0],
-                heard=made_by[1],
-            )
-        except ValidationError:  # a message refuses NaN and infinity
-            raise RunBroken(f'the estimate of node "{node}" is not finite at step {k}; its gains let it grow') from None
-        bus.publish(estimate(node), sent)
-        inbox.put(node, sent)
-        while (lacking := inbox.lacking) > 0:
-            _take_in(inbox, bus.receive(lacking))
-        mode, heard_now = inbox.mode, inbox.heard
-        assert mode is not None
-        x_hat, made_by = step(own, mode, heard_now), (mode, list(heard_now))
-        inbox.next_step()
-        k += 1
+    def work(_start: Control) -> None:
+        inbox = Inbox(own)
+        x_hat = np.zeros(problem.nx)
+        mode, heard = "", list[str]()  # what made x_hat
+        for k in count():
+            while inbox.y is None:
+                _put(inbox, measurements.next())
+            sent = _sent(own, k, x_hat, inbox.y, mode, heard)
+            bus.publish(estimate(node), sent)
+            inbox.put(node, sent)
+            while inbox.mode is None:
+                _put(inbox, modes.next())
+            while (sender := inbox.lacking) is not None:
+                _put(inbox, estimates[sender].next())
+            mode, heard = inbox.mode, list(inbox.heard)
+            x_hat = step(own, mode, inbox.heard)
+            inbox.next_step()
+            for sender in estimates.keys() - set(heard):  # whom this mode does not hear must not pile up
+                for sample in estimates[sender].waiting():
+                    _put(inbox, sample)
+
+    take_part(bus, gains, work)
 
 
-def _take_in(inbox: Inbox, items: list[Incoming]) -> None:
-    for item in items:
-        if not isinstance(item, Sample):
-            continue
-        model = model_of(item.topic)
-        assert model is not None  # only topics of the table are subscribed to
-        sender = item.topic.split("/")[1] if item.topic.startswith("node/") else ""
-        try:
-            inbox.put(sender, model.decode(item.payload))
-        except (ValidationError, ValueError) as error:
-            raise RunBroken(f"a message on {item.topic} cannot be used: {error}") from None
+def _sent(own: NodeGains, k: int, x_hat: Array, y: Array, mode: str, heard: list[str]) -> Estimate:
+    try:
+        return Estimate(
+            step=k,
+            x_hat=x_hat.tolist(),
+            innovation=innovation(own, y, x_hat).tolist(),
+            z_hat=(own.M @ x_hat).tolist(),
+            mode=mode,
+            heard=heard,
+        )
+    except ValidationError:  # a message refuses NaN and infinity
+        raise RunBroken(f'the estimate of node "{own.node}" is not finite at step {k}; its gains let it grow') from None
+
+
+def _put(inbox: Inbox, sample: Sample) -> None:
+    model = model_of(sample.topic)
+    assert model is not None  # only topics of the table are subscribed to
+    sender = sample.topic.split("/")[1] if sample.topic != MODE else ""
+    try:
+        inbox.put(sender, model.decode(sample.payload))
+    except ValidationError as error:
+        raise RunBroken(f"a message on {sample.topic} is not a {model.__name__}: {first_fault(error, {})}") from None
+    except ValueError as error:
+        raise RunBroken(f"a message on {sample.topic} cannot be used: {error}") from None

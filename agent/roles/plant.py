@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.bus import Bus, Sample
+from agent.bus import Bus
 from agent.contract.gains import Gains
-from agent.contract.messages import MODE, PLANT_STATE, Measurement, Mode, PlantState, measurement
+from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, Mode, PlantState, measurement
 from agent.contract.problem import Problem
 from agent.contract.schedule import DisturbanceSource, Losses
-from agent.roles.joining import join
+from agent.roles.joining import take_part
 
 
 def run(bus: Bus, gains: Gains) -> None:
-    """Take part as the plant until the run is closed (Bus.receive raises RunClosed)."""
+    """Take part as the plant until the run has ended."""
     problem = gains.problem
-    bus.subscribe([MODE])
+    modes = bus.channel(MODE)
     bus.advertise([PLANT_STATE, *map(measurement, problem.node_names)])
-    start = join(bus, gains)
-    plant = SimulatedPlant(problem, seed=start.seed)
-    simulated = [name for name in problem.node_names if name not in start.external]
-    while True:
-        for item in bus.receive():
-            if not isinstance(item, Sample):
-                continue
-            step = Mode.decode(item.payload).step
-            state, measurements = plant.advance(step)
-            for name in simulated:
-                bus.publish(measurement(name), measurements[name])
+
+    def work(start: Control) -> None:
+        plant = SimulatedPlant(problem, seed=start.seed)
+        while True:
+            state, measurements = plant.advance(Mode.decode(modes.next().payload).step)
+            for name, y in measurements.items():
+                if name not in start.external:
+                    bus.publish(measurement(name), y)
             bus.publish(PLANT_STATE, state)
+
+    take_part(bus, gains, work)
 
 
 class SimulatedPlant:

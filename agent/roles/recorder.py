@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from agent.bus import Bus, RunClosed, Sample
+from agent.bus import Bus, Channel, RunClosed, Sample
 from agent.contract.errors import Interrupted, RunBroken, first_fault
 from agent.contract.files import refuse_overwrite
 from agent.contract.gains import Gains
@@ -31,26 +31,20 @@ from agent.contract.recording import Logged, RecordingWriter
 from agent.ledger import Ledger
 from agent.roles.joining import join
 
-BATCH_SECONDS = 0.005  # how long messages gather before they are written
+SHORTEST_PAUSE = 0.002  # s, while messages come; they wait in their channels meanwhile
+LONGEST_PAUSE = 0.02  # s, while none do
 IDLE_SECONDS = 0.5  # silence after which it says what it lacks
 
 
 def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
-    """Take part as the recorder until the run is closed; raises RunBroken where it did not end well."""
+    """Take part as the recorder until the run has ended; raises RunBroken where it did not end well."""
     refuse_overwrite(path, force=force)
     names = gains.problem.node_names
-    bus.subscribe([MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)])
+    topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
+    channels = [bus.channel(topic) for topic in topics]
     start = join(bus, gains)
-    facts = _facts(bus.run, gains, start)
-    try:
-        _record(bus, gains, RecordingWriter(path, run=facts, gains=gains, force=force), window=start.window)
-    except OSError as error:
-        raise RunBroken(f"{path} could not be written: {error.strerror}") from error
-
-
-def _record(bus: Bus, gains: Gains, writer: RecordingWriter, *, window: int) -> None:
-    with writer:
-        recorder = Recorder(bus, gains, writer, window=window)
+    with RecordingWriter(path, run=_facts(bus.run, gains, start), gains=gains, force=force) as writer:
+        recorder = Recorder(bus, channels, gains, writer, window=start.window)
         try:
             recorder.record()
         except RunClosed as closed:
@@ -66,8 +60,10 @@ def _record(bus: Bus, gains: Gains, writer: RecordingWriter, *, window: int) -> 
 class Recorder:
     """The open recording, and the ledger of what is in it."""
 
-    def __init__(self, bus: Bus, gains: Gains, writer: RecordingWriter, *, window: int) -> None:
-        self._bus, self._writer = bus, writer
+    def __init__(
+        self, bus: Bus, channels: list[Channel], gains: Gains, writer: RecordingWriter, *, window: int
+    ) -> None:
+        self._bus, self._channels, self._writer = bus, channels, writer
         self._publishers = [COORDINATOR, PLANT, *map(node_who, gains.problem.node_names)]
         self._ledger = Ledger(gains.problem)
         self._quantum = max(1, window // 4)  # steps between acknowledgements
@@ -76,23 +72,29 @@ class Recorder:
 
     def record(self) -> None:
         """Until Bus.receive raises: the run is closed, the coordinator lost, or a signal came."""
-        batch = self._quantum * self._ledger.topics
+        pause = SHORTEST_PAUSE
         while True:
-            items = self._bus.receive(batch, timeout=BATCH_SECONDS)
-            if not items:
-                self._acknowledge()
-                items = self._bus.receive(1, timeout=min(IDLE_SECONDS, self._writer.flush_when_due()))
-            for item in items:
-                if isinstance(item, Sample):
-                    self._write(item)
-            if self._ledger.complete - self._acknowledged >= self._quantum:
-                self._acknowledge()
+            word = self._bus.receive(timeout=pause)
+            if isinstance(word, Sample):  # a replay that we asked for
+                self._write(word)
+            pause = SHORTEST_PAUSE if self._write_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             self._writer.flush_when_due()
             if time.monotonic() - self._last_write >= IDLE_SECONDS:
                 self._complain()
 
+    def _write_waiting(self) -> bool:
+        """Write what has come, acknowledging on the way; False where there was nothing."""
+        before = self._ledger.messages
+        for channel in self._channels:
+            for sample in channel.waiting():
+                self._write(sample)
+        if self._ledger.complete - self._acknowledged >= self._quantum or self._ledger.messages == before:
+            self._acknowledge()
+        return self._ledger.messages > before
+
     def close(self, *, status: str, reason: str) -> None:
         """Ask everybody for what is missing, end the file, and let everybody go."""
+        self._write_waiting()
         for who in self._publishers:
             self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
         for sample in self._bus.replayed(self._publishers):
@@ -105,6 +107,7 @@ class Recorder:
             end[f"missing.{who}"] = str(ledger.missing(who))
         self._writer.finish(end)
         self._acknowledge(closed=True)
+        self._bus.wait_for_leave(COORDINATOR)
 
     def _write(self, sample: Sample) -> None:
         model = model_of(sample.topic)
@@ -116,8 +119,9 @@ class Recorder:
             raise RunBroken(f"a message on {sample.topic} is not a {model.__name__}: {fault}") from None
         if not self._ledger.take(sample.topic, step, sample.stamp):
             return
-        number, published = sample.stamp[:2] if sample.stamp is not None else (0, sample.time)
-        self._writer.add(Logged(sample.topic, sample.payload, number, sample.time, published))
+        now = time.time_ns()
+        number, published = sample.stamp[:2] if sample.stamp is not None else (0, now)
+        self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
         self._last_write = time.monotonic()
 
     def _acknowledge(self, *, closed: bool = False) -> None:
