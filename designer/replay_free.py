@@ -35,7 +35,7 @@ def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs
 def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Iterator[FreeBlock]:
     """eta(k+1) = script A_k eta(k) + script B_k w(k) from eta(0) = 0, with two covariances beside it.
 
-    Path gain (theory of the realised run): X(k+1) = A_k X(k) A_k' + B_k B_k' from X(0) = 0 gives
+    Path gain: X(k+1) = A_k X(k) A_k' + B_k B_k' from X(0) = 0 gives
     gamma_path(k)^2 = lambda_max(M X(k) M').
 
     Rounding: where each step errs by d_j with |d_j| <= t m_j entry by entry, the free run is off by
@@ -44,7 +44,7 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
     """
     model, nx, size = central.model, central.problem.nx, central.model.A.shape[1]
 
-    @lru_cache(maxsize=64)
+    @lru_cache(maxsize=64)  # small networks have few different ones, large ones no room for many
     def transition(s: int, theta: bytes) -> Array:
         A_k = model.A[s].copy()
         A_k[nx:, :nx] += np.tensordot(np.frombuffer(theta) - model.beta, model.F[s], axes=1)
@@ -54,17 +54,16 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
     eta, covariances, diagonal = np.zeros(size), np.zeros((2, size, size)), np.arange(size)
     for first in range(0, log.steps, block):
         steps = range(first, min(first + block, log.steps))
-        s_of, A_of = inputs.mode[first : steps.stop].tolist(), []
+        s_of, thetas = inputs.mode[first : steps.stop].tolist(), [inputs.theta[k].tobytes() for k in steps]
         etas, reach = np.empty((len(steps), size)), np.empty((len(steps), size))
         for row, k in enumerate(steps):
             etas[row] = eta
-            A_k = transition(s_of[row], inputs.theta[k].tobytes())
-            A_of.append(A_k)
-            eta = A_k @ eta + model.B[s_of[row]] @ inputs.w[k]
+            eta = transition(s_of[row], thetas[row]) @ eta + model.B[s_of[row]] @ inputs.w[k]
             eta[nx:] -= central.H_bar[s_of[row]] @ inputs.u[k]
         squares = _magnitudes(log, central, inputs, etas, first) ** 2
         outputs = np.empty((len(steps), len(model.M), len(model.M)))
-        for row, A_k in enumerate(A_of):
+        for row in range(len(steps)):
+            A_k = transition(s_of[row], thetas[row])
             outputs[row] = model.M @ covariances[0] @ model.M.T
             reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
             covariances = A_k @ covariances @ A_k.T
