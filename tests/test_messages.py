@@ -1,0 +1,195 @@
+"""Messages are exact, flat and finite; keys, topics and the table that documents them are one."""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from agent.contract import messages
+from agent.contract.gains import Gains
+from agent.contract.messages import (
+    ACKNOWLEDGED,
+    CONTROL,
+    COORDINATOR,
+    EVENT,
+    MODE,
+    PLANT,
+    PLANT_STATE,
+    RECORDER,
+    Estimate,
+    Event,
+    Measurement,
+    Message,
+    Mode,
+    PlantState,
+    Stamp,
+    alive,
+    estimate,
+    in_words,
+    key,
+    measurement,
+    model_of,
+    node_who,
+    participants,
+    ready,
+    replay,
+    sensor_who,
+    topic_of,
+)
+
+MODELS = (Mode, PlantState, Measurement, Estimate, Event)
+EXAMPLES: tuple[Message, ...] = (
+    Mode(step=3, mode="joined"),
+    PlantState(step=3, x=[0.1, -0.0], z=[5e-324], w=[1e308], arrived=[1, 0]),
+    Measurement(step=3, y=[1 / 3]),
+    Estimate(step=3, x_hat=[0.1], innovation=[0.2], z_hat=[0.3], mode="joined", heard=["1", "2"]),
+    Event(step=3, kind="lost", who="node-1", detail='says "ü"'),
+)
+NAMES = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
+NUMBERS = st.lists(
+    st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from([-0.0, 5e-324, 1e308, -1.7976931348623157e308])
+)
+
+
+def bits(numbers: list[float]) -> bytes:
+    return struct.pack(f"{len(numbers)}d", *numbers)
+
+
+# encode, decode
+@given(st.integers(0, 2**63 - 1), NUMBERS, NUMBERS, NUMBERS)
+def test_every_float_comes_back_bit_for_bit(step: int, x_hat: list[float], y: list[float], z: list[float]) -> None:
+    sent = Estimate(step=step, x_hat=x_hat, innovation=y, z_hat=z, mode="1", heard=["1"])
+    came = Estimate.decode(sent.encode())
+    assert came.step == step
+    assert (bits(came.x_hat), bits(came.innovation), bits(came.z_hat)) == (bits(x_hat), bits(y), bits(z))
+    assert came.encode() == sent.encode()
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_every_message_comes_back(message: Message) -> None:
+    assert type(message).decode(message.encode()) == message
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("field", ["x_hat", "innovation", "z_hat"])
+def test_a_message_that_is_not_finite_is_never_made(field: str, number: float) -> None:
+    fields: dict[str, Any] = {"x_hat": [0.0], "innovation": [0.0], "z_hat": [0.0], field: [1.0, number]}
+    with pytest.raises(ValidationError):
+        Estimate(step=0, mode="", heard=[], **fields)
+
+
+@pytest.mark.parametrize("number", [b"NaN", b"Infinity", b"-Infinity", b"1e999", b"null", b'"1"', b"true", b"[1]"])
+def test_a_payload_with_something_else_than_finite_numbers_is_refused(number: bytes) -> None:
+    with pytest.raises(ValidationError):
+        Measurement.decode(b'{"step":0,"y":[' + number + b"]}")
+
+
+@pytest.mark.parametrize("step", [b"-1", b"1.5", b'"1"', b"true", b"null", b"9223372036854775808"])
+def test_a_step_is_a_natural_number_of_64_bits(step: bytes) -> None:
+    with pytest.raises(ValidationError):
+        Mode.decode(b'{"step":' + step + b',"mode":"1"}')
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"{}", b"[]", b"\xff", b'{"step":0}', b'{"step":0,"mode":"1","more":1}', b'{"step":0,"mode":"1"']
+)
+def test_missing_and_unknown_fields_are_refused(payload: bytes) -> None:
+    with pytest.raises(ValidationError):
+        Mode.decode(payload)
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_no_message_is_read_as_another(message: Message) -> None:
+    for other in MODELS:
+        if not isinstance(message, other):
+            with pytest.raises(ValidationError):
+                other.decode(message.encode())
+
+
+def test_messages_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        EXAMPLES[0].step = 4
+
+
+# schemas
+@pytest.mark.parametrize("model", MODELS)
+def test_schemas_are_flat(model: type[Message]) -> None:
+    """Viewers plot a field only where it is a number, a string, or a list of one of them."""
+    schema = model.model_json_schema()
+    assert schema["type"] == "object"
+    assert "step" in schema["required"]
+    assert "$defs" not in schema
+    for field in schema["properties"].values():
+        if field["type"] == "array":
+            assert field["items"]["type"] in {"number", "integer", "string"}
+        else:
+            assert field["type"] in {"integer", "string"}
+
+
+# keys and topics
+@given(NAMES, NAMES)
+def test_a_topic_is_the_inverse_of_its_key(run: str, node: str) -> None:
+    for topic in (MODE, PLANT_STATE, EVENT, measurement(node), estimate(node)):
+        assert topic_of(key(run, topic)) == topic
+        assert key(run, topic).split("/")[:2] == ["peakmesh", run]
+
+
+@given(NAMES)
+def test_every_topic_has_one_model(node: str) -> None:
+    models = [model_of(topic) for topic in (MODE, PLANT_STATE, measurement(node), estimate(node), EVENT)]
+    assert models == [Mode, PlantState, Measurement, Estimate, Event]
+
+
+@pytest.mark.parametrize(
+    "topic", ["", "modes", "plant", "plant/states", "node/1", "node/1/x", "node/a/b/estimate", CONTROL, ACKNOWLEDGED]
+)
+def test_what_is_no_topic_has_no_model(topic: str) -> None:
+    assert model_of(topic) is None
+
+
+@given(NAMES)
+def test_participants_are_named_in_words(node: str) -> None:
+    assert in_words(node_who(node)) == f'node "{node}"'
+    assert in_words(sensor_who(node)) == f'sensor "{node}"'
+    assert [in_words(who) for who in (COORDINATOR, PLANT, RECORDER)] == ["the coordinator", "the plant", "the recorder"]
+
+
+def test_everybody_takes_part_once(gains: Gains) -> None:
+    everybody = participants(gains.problem)
+    assert everybody == ["coordinator", "plant", "recorder", "node-n0", "node-n1", "node-n2"]
+
+
+def test_the_table_names_every_key_of_the_code() -> None:
+    """The docstring's tables have one row for each topic and each key, under the model the code gives it."""
+    rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in re.findall(r"^\|.*\|$", messages.__doc__, re.M)]
+    table = dict(row for row in rows if not row[0].startswith("-") and row[0] not in {"topic", "key"})
+    topics = {
+        topic: model_of(topic).__name__ for topic in (MODE, PLANT_STATE, EVENT, measurement("<n>"), estimate("<n>"))
+    }
+    keys = {
+        alive("<who>"): "liveliness",
+        ready("<who>"): "Ready",
+        CONTROL: "Control",
+        ACKNOWLEDGED: "Acknowledged",
+        replay("<who>"): "queryable",
+    }
+    assert table == topics | keys
+
+
+# stamps
+@given(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), NAMES)
+def test_a_stamp_comes_back(number: int, time: int, sender: str) -> None:
+    stamp = Stamp(number, time, node_who(sender))
+    assert Stamp.decode(stamp.encode()) == stamp
+
+
+@pytest.mark.parametrize("attachment", [b"", b"1", bytes(15), bytes(16), bytes(16) + b"\xff"])
+def test_what_is_no_stamp_is_refused(attachment: bytes) -> None:
+    with pytest.raises(ValueError, match=r"^a stamp is longer than 16 bytes, this one has|can't decode"):
+        Stamp.decode(attachment)
