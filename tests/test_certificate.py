@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from networks import random_gains, random_problem
 
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
@@ -17,7 +18,6 @@ from designer.certificate import check, inequality_17, inequality_18, least_gamm
 from designer.error_model import error_model, stacked_gains
 from designer.problems import find
 from designer.synthesis import design
-from networks import random_gains, random_problem
 
 Document = dict[str, Any]
 

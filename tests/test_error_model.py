@@ -6,12 +6,12 @@ from itertools import product
 
 import numpy as np
 import pytest
+from networks import random_gains, random_problem
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.back_off import corner
 from designer.error_model import error_model, link_gains, paper_error_model, stacks, step
-from networks import random_gains, random_problem
 
 SHAPES = [
     {"n": 3, "nx": 2, "nw": 2},

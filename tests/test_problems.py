@@ -33,7 +33,7 @@ def test_a_path_finds_a_problem_file(tmp_path: Path) -> None:
 
 def test_an_unknown_name_lists_the_built_in_ones() -> None:
     """What is neither a path nor a name is bad input, and the answer lists the names."""
-    with pytest.raises(InputError, match='"zhu2021" is neither.*"quadruple-tank".*"zhu2020-lossy"'):
+    with pytest.raises(InputError, match=r'"zhu2021" is neither.*"quadruple-tank".*"zhu2020-lossy"'):
         find("zhu2021")
 
 

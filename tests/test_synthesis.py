@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from networks import random_problem
 
 from agent.contract.errors import InputError, Unattainable
 from agent.contract.gains import Solver
@@ -13,7 +14,6 @@ from designer.certificate import verify
 from designer.lmi import LmiSolution
 from designer.problems import find
 from designer.synthesis import METHODS, design
-from networks import random_problem
 
 SOLVER = Solver(name="made up", version="0", status="optimal_inaccurate", iterations=1, seconds=0.0)
 
@@ -57,7 +57,7 @@ def test_a_node_gets_gains_only_from_nodes_that_it_hears() -> None:
 
 def test_an_unknown_method_lists_the_methods() -> None:
     """A wrong method is bad input, answered before anything is solved."""
-    with pytest.raises(InputError, match='"magic" does not exist; the methods are "theorem2"'):
+    with pytest.raises(InputError, match=r'"magic" does not exist; the methods are "theorem2"'):
         design(find("two-nodes"), method="magic")
 
 
@@ -79,7 +79,7 @@ def test_an_answer_that_the_check_does_not_confirm_is_refused(bad: str, monkeypa
     }
     wrong = LmiSolution(1.0, np.eye(1), Q[bad], np.ones((1, 2, 2)), 3.0 * np.ones((1, 2, 2)), SOLVER)
     monkeypatch.setitem(synthesis.METHODS, "wrong", lambda problem: wrong)
-    with pytest.raises(Unattainable, match="made up says optimal_inaccurate .*does not confirm.*; try"):
+    with pytest.raises(Unattainable, match=r"made up says optimal_inaccurate .*does not confirm.*; try"):
         design(find("two-nodes"), method="wrong")
 
 
