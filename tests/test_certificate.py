@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -183,3 +186,17 @@ def test_what_is_singular_in_exact_arithmetic_is_not_confirmed() -> None:
     for gamma, holds in ((2.0, False), (2.0 * (1.0 + 1e-12), True)):
         margin = check(problem, zero, zero, P=P, gamma=gamma).margins["(18) mode linked"]
         assert (margin > 0.0) is holds
+
+
+def test_verifying_imports_no_solver(gains: Gains, tmp_path: Path) -> None:
+    """The check runs in a process that never loads cvxpy, a conic solver or scipy."""
+    path = tmp_path / "gains.json"
+    gains.save(path)
+    code = (
+        "import sys; from pathlib import Path; from agent.contract.gains import Gains;"
+        "from designer.certificate import verify; assert verify(Gains.load(Path(sys.argv[1]))).holds;"
+        "print(sorted({'cvxpy', 'clarabel', 'scs', 'scipy'} & set(sys.modules)))"
+    )
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", code, path], cwd=root, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
