@@ -188,7 +188,8 @@ class RecordingReader:
             raise InputError(
                 f"{self.path} is cut or damaged before its first message: {_why(error)}; nothing can be read"
             ) from None
-        raise InputError(f"{self.path} is an MCAP file, but not a recording of peakmesh: it has no run metadata")
+        lack = "run metadata" if run is None else "gains"
+        raise InputError(f"{self.path} is an MCAP file, but not a recording of peakmesh: it has no {lack}")
 
     def messages(self) -> Iterator[Logged]:
         """Every message in the order of the file, as far as the file is sound."""
