@@ -11,7 +11,7 @@ from collections import defaultdict
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import listed
+from agent.contract.errors import counted, listed
 from agent.contract.gains import NodeGains
 from agent.contract.messages import Estimate, Measurement, Message, Mode
 from agent.filter import Pair
@@ -42,7 +42,9 @@ class Inbox:
                 self._modes[step] = mode
             case Measurement(step=step, y=y):
                 if len(y) != self._ny:
-                    raise ValueError(f"the measurement of step {step} has {len(y)} numbers; it must have {self._ny}")
+                    raise ValueError(
+                        f"the measurement of step {step} has {counted(len(y), 'number')}; it must have {self._ny}"
+                    )
                 self._measurements[step] = np.array(y)
             case Estimate(step=step, x_hat=x_hat, innovation=innovation):
                 if sender not in self._sizes:
@@ -50,8 +52,8 @@ class Inbox:
                 sizes = len(x_hat), len(innovation)
                 if sizes != self._sizes[sender]:
                     raise ValueError(
-                        f'the estimate of step {step} from node "{sender}" has {sizes[0]} states and {sizes[1]} '
-                        f"innovations; it must have {self._sizes[sender][0]} and {self._sizes[sender][1]}"
+                        f'the estimate of step {step} from node "{sender}" has {counted(sizes[0], "state")} and '
+                        f"{counted(sizes[1], 'innovation')}; it must have {' and '.join(map(str, self._sizes[sender]))}"
                     )
                 self._pairs[step][sender] = Pair(np.array(x_hat), np.array(innovation))
 
