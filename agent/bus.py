@@ -313,10 +313,10 @@ class Bus:
 
     def _wait_for(self, kind: type[T], *, deadline: float, missing: set[str]) -> T:
         """The next word of one kind; what else comes is kept for `receive`."""
-        for item in self._early:
-            if isinstance(item, kind):
-                self._early.remove(item)
-                return item
+        for early in self._early:
+            if isinstance(early, kind):
+                self._early.remove(early)
+                return early
         while True:
             item = self._take(deadline)
             if item is None:
@@ -370,7 +370,10 @@ def _raise(error: BaseException) -> None:
 
 def _sample(topic: str, sample: zenoh.Sample) -> Sample:
     attachment = sample.attachment
-    stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    try:
+        stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    except ValueError as error:
+        raise RunBroken(f"a message on {topic} has no readable stamp: {error}") from None
     return Sample(topic, sample.payload.to_bytes(), stamp)
 
 

@@ -155,7 +155,15 @@ class _Crew:
         code, words = child.process.returncode, child.last_words()
         if code < 0:
             raise RunBroken(f"{otherwise}: killed by {signal.Signals(-code).name}")
-        raise (InputError if code == EXIT_INPUT else RunBroken)(words or otherwise)
+        raise (InputError if code == EXIT_INPUT else RunBroken)(f"{words or otherwise}{self._cause(words)}")
+
+    def _cause(self, words: str) -> str:
+        """The last words of the child that the coordinator's `words` call lost."""
+        for who, child in self._children.items():
+            own = child.last_words()
+            if who != COORDINATOR and in_words(who) in words and child.process.returncode and own:
+                return f"; it said: {own}"
+        return ""
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._signal = self._signal or number
