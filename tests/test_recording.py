@@ -321,6 +321,19 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pyt
         RecordingWriter(tmp_path / "run.mcap", run=RUN, gains=GAINS)
 
 
+def test_a_failing_disk_breaks_the_run_and_leaves_what_it_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    with RecordingWriter(tmp_path / "run.mcap", run=RUN, gains=GAINS) as writer:
+        writer.add(MESSAGES[0])
+        monkeypatch.setattr(recording.os, "fsync", fail)
+        with pytest.raises(RunBroken, match=r"run\.mcap could not be written: Input/output error$"):
+            writer.finish(END)
+    assert not (tmp_path / "run.mcap").exists()
+    assert read(tmp_path / "run.mcap.part").messages == MESSAGES[:1]
+
+
 def test_others_can_read_what_is_older_than_the_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Within FLUSH_SECONDS a message may be in memory only; then the file has it, while it is still written to."""
     now = 100.0

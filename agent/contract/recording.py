@@ -12,6 +12,7 @@ import os
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, Self
@@ -77,10 +78,14 @@ class RecordingWriter:
             ("layout.json", json.dumps(foxglove_layout(gains.problem)).encode()),
         ):
             self._writer.add_attachment(now, now, name, "application/json", data)
-        self._writer.flush()
+        with self._writing():
+            self._writer.flush()
 
     def add(self, message: Logged) -> None:
-        """Append one message. Raises RunBroken for what MCAP or the format cannot hold, before writing it."""
+        """Append one message. Raises RunBroken for what MCAP or the format cannot hold, before writing it.
+
+        Every method raises RunBroken where the disk is full or fails.
+        """
         channel = self._channels.get(message.topic)
         if channel is None:
             channel = self._register(message.topic)
@@ -91,34 +96,37 @@ class RecordingWriter:
             and _counts(message.publish_time, 2**63)
         ):  # a wrong argument would corrupt the open chunk under a valid checksum
             raise RunBroken(f"{self._path.name}: a message on {message.topic} cannot be recorded: {message}")
-        self._writer.add_message(channel, message.log_time, message.payload, message.publish_time, message.number)
+        with self._writing():
+            self._writer.add_message(channel, message.log_time, message.payload, message.publish_time, message.number)
 
     def flush_when_due(self) -> float:
         """Flush and sync as often as promised; returns the seconds until it is due again."""
         now = time.monotonic()
         if now - self._flushed >= FLUSH_SECONDS:
-            self._writer.flush()
-            self._flushed = now
-            if now - self._synced >= SYNC_SECONDS:
-                os.fsync(self._file.fileno())
-                self._synced = now
+            with self._writing():
+                self._writer.flush()
+                self._flushed = now
+                if now - self._synced >= SYNC_SECONDS:
+                    os.fsync(self._file.fileno())
+                    self._synced = now
         return self._flushed + FLUSH_SECONDS - now
 
     def finish(self, end: dict[str, str]) -> None:
         """Write `end`, the index, and give the file its name."""
-        self._writer.flush()  # the messages first: where `end` can be read, nothing was cut before it
-        self._writer.add_metadata("end", end)
-        self._writer.finish()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        self._part.replace(self._path)
+        with self._writing():
+            self._writer.flush()  # the messages first: where `end` can be read, nothing was cut before it
+            self._writer.add_metadata("end", end)
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._part.replace(self._path)
 
     def close(self) -> None:
         """Let go of the file; without `finish` it stays `.part`, cut but readable."""
         if not self._file.closed:
-            self._writer.flush()
-            self._file.close()
+            with self._writing(), self._file:
+                self._writer.flush()
 
     def __enter__(self) -> Self:
         return self
@@ -127,6 +135,13 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise RunBroken(f"{self._path} could not be written: {error.strerror}") from error
 
     def _register(self, topic: str) -> int:
         model = model_of(topic)
