@@ -48,6 +48,20 @@ def test_saved_gains_are_loaded_again(tmp_path: Path, gains: Gains) -> None:
     assert Gains.load(tmp_path / "gains.json") == gains
 
 
+def backwards(document: Any) -> Any:
+    """The same document with the keys of every table in the opposite order."""
+    if isinstance(document, dict):
+        return {key: backwards(document[key]) for key in reversed(document)}
+    return [backwards(item) for item in document] if isinstance(document, list) else document
+
+
+def test_the_digest_does_not_depend_on_the_order_of_the_keys(gains: Gains) -> None:
+    data = json.dumps(backwards(json.loads(gains.canonical())), indent=2).encode()
+    again = Gains.from_bytes(data, source="gains")
+    assert again.canonical() == gains.canonical()
+    assert again.digest() == gains.digest()
+
+
 @pytest.mark.parametrize(("ny", "modes"), [((1,), 1), ((2, 1), 1), ((1, 1, 2), 3)])
 def test_a_node_gets_its_own_links(ny: tuple[int, ...], modes: int) -> None:
     """One link for every a_ij > 0, in file order, with the problem's weight and the file's K_ij and H_ij."""

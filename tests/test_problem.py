@@ -92,10 +92,12 @@ def test_arrays_cannot_be_written_to(tmp_path: Path) -> None:
 
 
 def test_hears_gives_the_same_problem_as_adjacency(tmp_path: Path) -> None:
-    heard = edited(JOINED, 'hears = { "left" = ["right"], "right" = ["left", "right"] }')
+    """Who is named before the sign is the receiver, row i of a_ij; a node hears itself, said or not."""
+    one_way = edited(JOINED, "adjacency = [[1, 1], [0, 1]]")
+    heard = edited(JOINED, 'hears = { "left" = ["right"], "right" = ["right"] }')
     apart = heard.replace("adjacency = [[1, 0], [0, 1]]", "hears = {}")
-    assert load(tmp_path, apart) == load(tmp_path, TEXT)
-    assert load(tmp_path, apart).digest() == load(tmp_path, TEXT).digest()
+    assert load(tmp_path, apart) == load(tmp_path, one_way)
+    assert load(tmp_path, apart).digest() == load(tmp_path, one_way).digest()
 
 
 def test_without_disturbance_there_is_none(tmp_path: Path) -> None:

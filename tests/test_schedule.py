@@ -142,6 +142,13 @@ def test_what_has_probability_0_never_happens_and_1_always() -> None:
     assert ring == [(2 + step) % 3 for step in range(300)]
 
 
+@pytest.mark.parametrize("draw", [0.0, 1.0 - 2.0**-53])
+def test_the_rarest_draws_do_not_bring_what_has_probability_0(draw: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Stream, "at", lambda self, step: np.array([draw]))
+    row = [0.0, 1.0, 0.0]
+    assert list(itertools.islice(modes(chain([row, row, row]), seed=0), 4)) == [2, 1, 1, 1]
+
+
 @pytest.mark.parametrize("miss", [-0.9e-9, 0.9e-9])
 def test_a_row_that_misses_1_by_rounding_draws_a_mode_that_exists(miss: float, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = chain([[0.5, 0.5 + miss], [0.5, 0.5 + miss]])
