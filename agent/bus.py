@@ -43,6 +43,7 @@ from agent.contract.messages import (
 )
 
 LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
+BUFFER = 16_384  # bytes, of each direction of each link; messages are small, links are many
 CAPACITY = 8192  # messages that a channel holds; far more than a window lets come
 CLOSE_SECONDS = 1.5  # how long a leaving participant waits for the recorder's last word
 
@@ -129,9 +130,10 @@ class Bus:
         self._alone = True
         self._present: set[str] = set()  # whose token is there
         self._last_word: Acknowledged | None = None  # that the recording is closed
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._on_signal)
         self._session = _open(network)
+        self._handlers = {
+            number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        }
 
     # Declare: first what we receive, then what we send, the token last.
     def channel(self, topic: str) -> Channel:
@@ -167,13 +169,14 @@ class Bus:
         self._declared.append(liveliness.declare_token(key(self.run, alive(self.who))))
 
     # Start together.
-    def meet(self, others: Iterable[str]) -> None:
-        """Wait for everybody's token; RunBroken names who is missing when the time is over."""
+    def meet(self, others: Iterable[str]) -> Iterator[str]:
+        """Wait for everybody's token, and yield who has come; RunBroken names who is missing when time is over."""
         absent = set(others) - {self.who}
         deadline = time.monotonic() + self.network.wait
         while absent:
             peer = self._wait_for(Peer, deadline=deadline, missing=absent)
             absent.discard(peer.who)
+            yield peer.who
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
         """The coordinator's: wait until everybody has met everybody."""
@@ -287,6 +290,8 @@ class Bus:
     ) -> None:
         for declared in reversed(self._declared):  # the token first: the others see us go
             declared.undeclare()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
         self._session.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
 
     # Inside.
@@ -405,7 +410,10 @@ def _open(network: Network) -> zenoh.Session:
             },
         },
         "adminspace": {"enabled": True},  # tells the port that 0 became
-        "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": LEASE_MS}}},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {"tx": {"lease": LEASE_MS, "batch_size": BUFFER}, "rx": {"buffer_size": BUFFER}},
+        },
     }
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))

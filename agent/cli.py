@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import re
-import secrets
 import signal
 import sys
 import threading
@@ -96,7 +95,7 @@ def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str
     from agent.launch import launch
 
     plan = _plan(options, gains)
-    run = f"{gains.problem.name}-{secrets.token_hex(4)}"
+    run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
     refuse_overwrite(recording, force=options.force)
     with _progress(plan.steps) as report:
@@ -307,9 +306,13 @@ def _say_to_launcher(word: dict[str, Any]) -> None:
 
 
 def _say_to_person(word: dict[str, Any]) -> None:
+    from agent.contract.messages import in_words
+
     match word:
         case {"listening": addresses}:
             print(f"listening at {', '.join(addresses)}", file=sys.stderr)
+        case {"joined": who}:
+            print(f"{in_words(who)} is there", file=sys.stderr)
         case {"started": _}:
             print("everybody is there: the run starts", file=sys.stderr)
         case {"summary": summary}:

@@ -40,7 +40,7 @@ class Summary(NamedTuple):
     missing: int
 
 
-Word = dict[str, Any]  # what the coordinator reports: {"started": time} or {"complete": steps}
+Word = dict[str, Any]  # what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}
 
 
 class Lost(RunBroken):
@@ -91,7 +91,8 @@ class Conductor:
         """The barrier, and the order to start."""
         everybody = participants(self._gains.problem)
         self._bus.enter()
-        self._bus.meet([*everybody, *map(sensor_who, self._plan.external)])
+        for who in self._bus.meet([*everybody, *map(sensor_who, self._plan.external)]):
+            self._report({"joined": who})
         for who, ready in self._bus.gather(everybody).items():
             if ready.gains != self._gains.digest():
                 raise InputError(

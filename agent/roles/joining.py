@@ -14,7 +14,8 @@ from agent.contract.messages import Control, participants
 def join(bus: Bus, gains: Gains) -> Control:
     """Enter, meet everybody, say so, and wait for the start. Topics must be declared before."""
     bus.enter()
-    bus.meet(participants(gains.problem))
+    for _ in bus.meet(participants(gains.problem)):
+        pass
     bus.report_ready(gains.digest())
     return bus.wait_for_start()
 
