@@ -131,9 +131,7 @@ class Bus:
         self._present: set[str] = set()  # whose token is there
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._session = _open(network)
-        self._handlers = {
-            number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        self._handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
 
     # Declare: first what we receive, then what we send, the token last.
     def channel(self, topic: str) -> Channel:
@@ -303,7 +301,7 @@ class Bus:
             item = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
         except Empty:
             return None
-        if item is not None:
+        if item is not None and not (isinstance(item, Peer) and item.who == self.who):
             self._alone = False
         match item:
             case Acknowledged(received=received, closed=closed):

@@ -91,13 +91,13 @@ def run_command(options: argparse.Namespace) -> int:
 
 def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str, Any]:
     """Run the gains in `path` on this machine; returns the facts of the run."""
-    from agent.contract.files import refuse_overwrite
+    from agent.contract.recording import refuse_recording
     from agent.launch import launch
 
     plan = _plan(options, gains)
     run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
-    refuse_overwrite(recording, force=options.force)
+    refuse_recording(recording, force=options.force)
     with _progress(plan.steps) as report:
         summary = launch(
             path, gains, plan, run=run, recording=recording, force=options.force, wait=options.wait, report=report

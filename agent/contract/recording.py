@@ -51,14 +51,19 @@ class Logged(NamedTuple):
     publish_time: int
 
 
+def refuse_recording(path: Path, *, force: bool) -> Path:
+    """The `.part` file that a recording would be written to; InputError where it or `path` may not be replaced."""
+    part = path.with_name(path.name + ".part")
+    refuse_overwrite(path, force=force)
+    refuse_overwrite(part, force=force)
+    return part
+
+
 class RecordingWriter:
     """Writes `<path>.part`, and renames it to `path` when the run has ended. Not thread-safe."""
 
     def __init__(self, path: Path, *, run: dict[str, str], gains: Gains, force: bool = False) -> None:
-        refuse_overwrite(path, force=force)
-        self._path = path
-        self._part = path.with_name(path.name + ".part")
-        refuse_overwrite(self._part, force=force)
+        self._path, self._part = path, refuse_recording(path, force=force)
         try:
             self._file = self._part.open("wb")
         except OSError as error:

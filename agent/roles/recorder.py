@@ -12,7 +12,6 @@ from pydantic import ValidationError
 
 from agent.bus import Bus, Channel, RunClosed, Sample
 from agent.contract.errors import Interrupted, RunBroken, first_fault
-from agent.contract.files import refuse_overwrite
 from agent.contract.gains import Gains
 from agent.contract.messages import (
     COORDINATOR,
@@ -27,7 +26,7 @@ from agent.contract.messages import (
     model_of,
     node_who,
 )
-from agent.contract.recording import Logged, RecordingWriter
+from agent.contract.recording import Logged, RecordingWriter, refuse_recording
 from agent.ledger import Ledger
 from agent.roles.joining import join
 
@@ -38,7 +37,7 @@ IDLE_SECONDS = 0.5  # silence after which it says what it lacks
 
 def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
     """Take part as the recorder until the run has ended; raises RunBroken where it did not end well."""
-    refuse_overwrite(path, force=force)
+    refuse_recording(path, force=force)
     names = gains.problem.node_names
     topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
     channels = [bus.channel(topic) for topic in topics]

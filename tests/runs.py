@@ -1,0 +1,127 @@
+"""Starts real runs for tests: the program itself, its roles one by one, and what can be done to their processes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from agent.contract.messages import Message, model_of
+from agent.contract.recording import Logged, RecordingReader
+
+PATIENCE = 60.0  # seconds after which a wait of a test has failed
+
+
+def program(*arguments: object) -> list[str]:
+    """The command line of `peakmesh`."""
+    return [sys.executable, "-m", "designer", *map(str, arguments)]
+
+
+def peakmesh(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(program(*arguments), capture_output=True, text=True, timeout=PATIENCE, cwd=cwd, check=False)
+
+
+@contextlib.contextmanager
+def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """A command that is running; killed at the end of the block if it still is."""
+    process = subprocess.Popen(
+        program(*arguments), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        process.communicate()
+
+
+def line_with(process: subprocess.Popen[str], text: str) -> str:
+    """The first line of stderr that has `text`."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if text in line:
+            return line
+    raise AssertionError(f'"{text}" was never said')
+
+
+def child(parent: int, *words: str) -> int:
+    """The process id of a child of `parent` whose command line has all `words`."""
+    found = [pid for pid, command in children(parent).items() if all(word in command for word in words)]
+    assert len(found) == 1, (words, children(parent))
+    return found[0]
+
+
+def children(parent: int) -> dict[int, list[str]]:
+    """Process ids and command lines of the children of `parent`."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[1]) == parent:
+                found[int(entry.name)] = (entry / "cmdline").read_text().split("\0")
+    return found
+
+
+def wait_until_gone(pids: list[int]) -> None:
+    """Until none of these processes runs any more."""
+    deadline = time.monotonic() + PATIENCE
+    while any(_runs(pid) for pid in pids):
+        assert time.monotonic() < deadline, f"still running: {[pid for pid in pids if _runs(pid)]}"
+        time.sleep(0.01)
+
+
+def _runs(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def logged(path: Path) -> list[Logged]:
+    """All messages of a recording, as far as it goes."""
+    with RecordingReader(path) as reader:
+        return list(reader.messages())
+
+
+def end_of(path: Path) -> dict[str, str] | None:
+    """The `end` metadata of a recording."""
+    with RecordingReader(path) as reader:
+        for _ in reader.messages():
+            pass
+        return reader.end
+
+
+def numbers_of(path: Path) -> dict[tuple[str, int], bytes]:
+    """The payload of every topic and step, but for events."""
+    found = {}
+    for message in logged(path):
+        if message.topic != "event":
+            found[message.topic, decoded(message).step] = message.payload
+    return found
+
+
+def decoded(message: Logged) -> Message:
+    model = model_of(message.topic)
+    assert model is not None
+    return model.decode(message.payload)
+
+
+def answer(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """The JSON object that a command printed."""
+    assert done.stdout, done.stderr
+    return dict(json.loads(done.stdout))
+
+
+def freeze(pid: int) -> None:
+    os.kill(pid, signal.SIGSTOP)
+
+
+def thaw(pid: int) -> None:
+    os.kill(pid, signal.SIGCONT)
