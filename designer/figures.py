@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 
 from agent.contract.arrays import Array
 from agent.contract.files import refuse_overwrite, write_whole
-from designer.replay_log import Log, load
+from designer.replay.log import Log, load
 
 # Okabe and Ito 2008, told apart by readers of every colour vision; black is kept for the plant
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

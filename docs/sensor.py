@@ -1,19 +1,22 @@
-"""A sensor of your own for one node: python sensor.py RUN NODE ADDRESS-OF-COORDINATOR"""
-import json, queue, sys, zenoh
+"""A sensor of your own for one node: python sensor.py RUN NODE ADDRESS-OF-COORDINATOR."""
 
-run, node, address = sys.argv[1:4]
-config = zenoh.Config.from_json5(json.dumps({
-    "mode": "peer", "connect": {"endpoints": [address]}, "listen": {"endpoints": ["tcp/127.0.0.1:0"]},
-    "scouting": {"multicast": {"enabled": False}}}))
+import json
+import queue
+import sys
+
+import zenoh
+
+base, node, address = f"peakmesh/{sys.argv[1]}", sys.argv[2], sys.argv[3]
+config = zenoh.Config()
+config.insert_json5("connect/endpoints", json.dumps([address]))
+config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
-    modes, tokens = queue.SimpleQueue(), session.liveliness()
-    session.declare_subscriber(f"peakmesh/{run}/mode", modes.put)
-    out = session.declare_publisher(f"peakmesh/{run}/node/{node}/measurement", congestion_control=zenoh.CongestionControl.BLOCK)
-    waiting, seen = {f"peakmesh/{run}/alive/node-{node}", f"peakmesh/{run}/alive/recorder"}, queue.SimpleQueue()
-    tokens.declare_subscriber(f"peakmesh/{run}/alive/*", seen.put, history=True)
-    while waiting:  # whoever we have seen here has subscribed before, and loses nothing
-        waiting.discard(str(seen.get().key_expr))
-    token = tokens.declare_token(f"peakmesh/{run}/alive/sensor-{node}")  # the run may start
-    while True:  # one mode for each step; here the sensor is read
-        step = json.loads(modes.get().payload.to_bytes())["step"]
-        out.put(json.dumps({"step": step, "y": [0.0]}))
+    modes, tokens, waiting = queue.SimpleQueue(), queue.SimpleQueue(), {f"node-{node}", "recorder"}
+    session.declare_subscriber(f"{base}/mode", modes.put)
+    session.liveliness().declare_subscriber(f"{base}/alive/*", tokens.put, history=True)
+    while waiting:  # whoever is seen here has subscribed before, and will miss nothing
+        waiting.discard(str(tokens.get().key_expr).rpartition("/")[2])
+    ready = session.liveliness().declare_token(f"{base}/alive/sensor-{node}")  # now the run may start
+    while step := modes.get().payload.to_string():  # one mode for each step: read the sensor, publish y
+        y = json.dumps({"step": json.loads(step)["step"], "y": [0.0]})
+        session.put(f"{base}/node/{node}/measurement", y, congestion_control=zenoh.CongestionControl.BLOCK)

@@ -10,7 +10,7 @@ from made_recordings import random_gains, random_problem, record, simulate
 
 from agent.contract.errors import InputError
 from designer import figures
-from designer.replay_log import Log, load
+from designer.replay.log import Log, load
 
 STEPS = 50
 

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from designer.replay import replay, tolerance
-from designer.verdict import Verdict
+from designer.replay.verdict import Verdict
 
 STEPS = 60
 GAINS = random_gains(random_problem(3))

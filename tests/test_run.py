@@ -35,7 +35,7 @@ from agent.contract.gains import Gains
 from agent.launch import launch
 from agent.plan import Plan
 from designer.replay import replay
-from designer.verdict import Verdict
+from designer.replay.verdict import Verdict
 
 MANY = 100_000  # steps of a run that a test ends itself
 

@@ -19,8 +19,8 @@ from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.messages import EVENT, MODE, PLANT_STATE, Event, estimate, measurement
 from agent.contract.recording import Logged, RecordingReader
-from designer.replay_census import Census, take_census
-from designer.replay_topics import Numbers, Senders, Topic, Words, topics_of
+from designer.replay.census import Census, take_census
+from designer.replay.topics import Numbers, Senders, Topic, Words, topics_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,10 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from agent.contract.problem import Problem
-from designer import replay_free, replay_proofs
-from designer.replay_log import Log, load
-from designer.replay_proofs import Central, Check
-from designer.verdict import Divergence, Proof, Verdict
+from designer.replay import free_run, proofs
+from designer.replay.log import Log, load
+from designer.replay.proofs import Central, Check
+from designer.replay.verdict import Divergence, Proof, Verdict
 
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
 _STEPS_AT_ONCE = 1024
@@ -106,7 +106,7 @@ class Peak:
     def __init__(self) -> None:
         self.peak, self.margin, self.compared, self.holds = 0.0, np.inf, 0, True
 
-    def add(self, path: replay_free.Path, tolerance: float) -> None:
+    def add(self, path: free_run.Path, tolerance: float) -> None:
         known = ~np.isnan(path.error) & ~np.isnan(path.bound)
         error, bound = path.error[known], path.bound[known]
         self.compared += int(known.sum())
@@ -118,27 +118,27 @@ class Peak:
 
 def _compare(log: Log, central: Central, tally: Tally) -> tuple[Peak, float] | None:
     """All checks, a block of steps at a time; returns peak and energy where there is a plant."""
-    drawn = replay_proofs.draw(log)
+    drawn = proofs.draw(log)
     inputs, eta, hears = (
-        replay_proofs.logged_inputs(log),
-        replay_proofs.logged_states(log),
-        replay_proofs.neighbours(log),
+        proofs.logged_inputs(log),
+        proofs.logged_states(log),
+        proofs.neighbours(log),
     )
-    tally.add(replay_proofs.start_checks(log, central))
+    tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
         now = slice(first, min(first + _STEPS_AT_ONCE, log.steps))
-        tally.add(replay_proofs.input_checks(log, central, drawn, now))
-        tally.add(replay_proofs.step_checks(log, central, inputs, eta, now))
-        tally.add(replay_proofs.message_checks(log, central, hears, now))
-    whole = replay_free.complete(inputs, drawn, log, central)
+        tally.add(proofs.input_checks(log, central, drawn, now))
+        tally.add(proofs.step_checks(log, central, inputs, eta, now))
+        tally.add(proofs.message_checks(log, central, hears, now))
+    whole = free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
     peak = Peak()
-    for part in replay_free.free_run(log, central, whole, block=block):
-        tally.add([replay_free.free_check(log, central, part, eta)])
+    for part in free_run.free_run(log, central, whole, block=block):
+        tally.add([free_run.free_check(log, central, part, eta)])
         if log.has_plant:
-            peak.add(replay_free.path_block(log, central, part, energy_before), tally.tolerance)
+            peak.add(free_run.path_block(log, central, part, energy_before), tally.tolerance)
     return (peak, float(energies.sum())) if log.has_plant else None
 
 

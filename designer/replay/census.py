@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from designer.replay_topics import Topic
+from designer.replay.topics import Topic
 
 NAMED = 20  # so many faults of a kind are named, the others counted
 

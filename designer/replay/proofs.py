@@ -17,8 +17,8 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.error_model import ErrorModel, Stacks, error_model, measurement_slices, stacked_gains, stacks
-from designer.replay_log import Log
-from designer.replay_topics import Numbers
+from designer.replay.log import Log
+from designer.replay.topics import Numbers
 
 FLOOR = 1e-140  # magnitudes below it count as this: their squares underflow in the free run's bound
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO
-from designer.replay_census import Faults
+from designer.replay.census import Faults
 
 CLAIMS = {
     1: "plant, sensors, draws and each node's own words agree",

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.replay_log import Log
-from designer.replay_proofs import FLOOR, Central, Check, Drawn, Inputs, numbers
+from designer.replay.log import Log
+from designer.replay.proofs import FLOOR, Central, Check, Drawn, Inputs, numbers
 
 
 class FreeBlock(NamedTuple):
