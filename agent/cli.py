@@ -70,13 +70,16 @@ def add_roles(commands: Subcommands) -> None:
     coordinator = _role(commands, "coordinator", coordinator_command, "start the run, give out the modes, end it")
     _plan_options(coordinator)
     recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
-    _recording_options(recorder)
+    _output_options(recorder, *RECORDING)
 
 
-def add_run_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `run`, but for what to run."""
+RECORDING = "FILE", "recording (recordings/<run>.mcap)"
+
+
+def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] = RECORDING) -> None:
+    """The options of `run`, but for what to run; `output` is what --output takes, and its help."""
     _plan_options(parser)
-    _recording_options(parser)
+    _output_options(parser, *output)
     parser.add_argument("--wait", type=_positive, default=30.0, metavar="S", help="how long to wait for all (30)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -211,9 +214,9 @@ def _plan_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _recording_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="recording (recordings/<run>.mcap)")
-    parser.add_argument("--force", action="store_true", help="replace the recording if it exists")
+def _output_options(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:
+    parser.add_argument("-o", "--output", type=Path, metavar=metavar, help=about)
+    parser.add_argument("--force", action="store_true", help="replace what exists")
 
 
 def _network_options(parser: argparse.ArgumentParser) -> None:

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import agent.cli
-from agent.contract.errors import EXIT_GOOD, EXIT_NO
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 from agent.contract.files import refuse_overwrite
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
+    from agent.contract.problem import Problem
 
+METHODS = "theorem2 (the default): the LMI of Zhu et al. 2020; theorem2-reduced: the same for [x; e], faster"
 PROBLEM = "problem file, or the name of a built-in problem (peakmesh show lists them)"
 
 
@@ -47,20 +49,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _add_demo(commands: agent.cli.Subcommands) -> None:
     demo = agent.cli.add_command(commands, "demo", demo_command, "design, run, replay and picture an example")
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
-    agent.cli.add_run_options(demo)
+    agent.cli.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
 
 
 def demo_command(options: argparse.Namespace) -> int:
     """`peakmesh demo`: the whole job; its files go to a folder of their own."""
+    from designer.problems import find
     from designer.replay import replay
 
+    problem = find(options.problem)
     folder = options.output or Path("recordings") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; --output takes the folder for the demo's files")
     folder.mkdir(parents=True, exist_ok=True)
     gains_path, options.output = folder / "gains.json", folder / "run.mcap"
     for path in (gains_path, options.output):
         refuse_overwrite(path, force=options.force)
 
-    gains, designed = _design(options.problem, "theorem2", gains_path, force=options.force)
+    gains, designed = _design(problem, "theorem2", gains_path, force=options.force)
     _say(options, f"1. design\n{_design_text(designed)}")
     ran = agent.cli.run_gains(gains_path, gains, options)
     _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{agent.cli.run_text(ran)}")
@@ -78,26 +84,25 @@ def _add_design(commands: agent.cli.Subcommands) -> None:
     design = agent.cli.add_command(commands, "design", design_command, "gains with a certificate, for a problem")
     design.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
     design.add_argument("-o", "--output", type=Path, metavar="FILE", help="gains file (<problem>.gains.json)")
-    design.add_argument("--method", default="theorem2", metavar="NAME", help="theorem2: the LMI of Zhu et al. 2020")
+    design.add_argument("--method", default="theorem2", metavar="NAME", help=METHODS)
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     design.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
-    _, result = _design(options.problem, options.method, options.output, force=options.force)
+    from designer.problems import find
+
+    _, result = _design(find(options.problem), options.method, options.output, force=options.force)
     print(json.dumps(result) if options.json else _design_text(result))
     return EXIT_GOOD
 
 
-def _design(text: str, method: str, output: Path | None, *, force: bool) -> tuple[Gains, dict[str, Any]]:
-    """Design gains for a problem given by path or name, and save them."""
-    from designer.problems import find
-
-    problem = find(text)
+def _design(problem: Problem, method: str, output: Path | None, *, force: bool) -> tuple[Gains, dict[str, Any]]:
+    """Design gains and save them; returns them and the facts to print."""
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
-    from designer.synthesis import design
+    from designer.synthesis import design  # only now: it loads a solver
 
     gains = design(problem, method=method)
     gains.save(path, force=force)
@@ -168,7 +173,7 @@ def run_command(options: argparse.Namespace) -> int:
         options.output = agent.cli.default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_overwrite(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
-    gains, _ = _design(options.gains, "theorem2", path, force=options.force)
+    gains, _ = _design(problem, "theorem2", path, force=options.force)
     print(f"designed {path}, gamma = {gains.certificate.gamma:.6f}", file=sys.stderr)
     result = {"gains": str(path), **agent.cli.run_gains(path, gains, options)}
     print(json.dumps(result) if options.json else f"{agent.cli.run_text(result)}\ngains      {path}")

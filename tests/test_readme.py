@@ -1,0 +1,57 @@
+"""What the README says is so."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from agent.contract.errors import InputError
+from agent.contract.problem import Problem
+from designer.cli import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_its_problem_is_a_problem() -> None:
+    """The example of a problem file loads, and the example of a refusal is what it says."""
+    (text,) = blocks("toml")
+    document = tomllib.loads(text)
+    assert Problem.from_document(document).node_names == ("inflow", "level")
+    document["node"][0]["C"] = [[1.0]]
+    with pytest.raises(InputError) as caught:
+        Problem.from_document(document)
+    assert f"peakmesh: tank.toml: {caught.value}\n" in README
+
+
+def test_its_sensor_is_the_script() -> None:
+    """The sensor in the README is docs/sensor.py to the letter."""
+    (text,) = blocks("python")
+    assert text == (ROOT / "docs" / "sensor.py").read_text()
+
+
+def test_its_commands_exist(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every `peakmesh COMMAND --option` in it is known to the program."""
+    found = re.findall(r"^ *(?:\S*/)?peakmesh (\w+)((?: .*)?)$", "\n".join(blocks("sh")), flags=re.MULTILINE)
+    assert {"show", "design", "verify", "run", "replay", "coordinator", "node", "plant", "recorder"} <= {
+        command for command, _ in found
+    }
+    for command, rest in found:
+        with pytest.raises(SystemExit) as caught:
+            main([command, "--help"])
+        assert caught.value.code == 0
+        known = capsys.readouterr().out
+        assert all(option in known for option in re.findall(r"--\w+", rest.partition("#")[0])), (command, rest)
+
+
+def test_ci_runs_its_test_command() -> None:
+    """`.ci/run` takes the test command from here; there is one."""
+    assert len([line for line in README.splitlines() if "bin/pytest" in line]) == 1
+    assert "grep -m1 'bin/pytest' README.md" in (ROOT / ".ci" / "run").read_text()
