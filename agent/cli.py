@@ -198,7 +198,7 @@ def _role(
 
 def _plan_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=_count, default=200, metavar="N", help="how many steps (200)")
-    parser.add_argument("--seed", type=_natural, default=0, metavar="N", help="of modes, losses, disturbance (0)")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of modes, losses, disturbance (0)")
     parser.add_argument(
         "--window", type=_count, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
     )
@@ -240,24 +240,27 @@ def _run_name(text: str) -> str:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0.0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
     return value
 
 
+def _whole(text: str, *, least: int, most: int) -> int:
+    if not (text.isdecimal() and len(text) < 20 and least <= int(text) <= most):
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from {least} to {most}")
+    return int(text)
+
+
 def _count(text: str) -> int:
-    value = int(text)
-    if not 1 <= value < 2**31:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 1 on")
-    return value
+    return _whole(text, least=1, most=2**31 - 1)
 
 
-def _natural(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number from 0 on")
-    return value
+def _seed(text: str) -> int:
+    return _whole(text, least=0, most=2**63 - 1)
 
 
 def load_gains(path: Path) -> Gains:

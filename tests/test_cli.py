@@ -11,6 +11,7 @@ from made_recordings import record, simulate
 from agent.contract.gains import Gains
 from designer.cli import main
 from designer.problems import names
+from designer.synthesis import METHODS
 
 ROOT = Path(__file__).parents[1]
 
@@ -134,6 +135,14 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(SystemExit) as caught:
             run(*words)
         assert caught.value.code == 2
+    for words in (["--steps", "x"], ["--steps", "1.5"], ["--seed", "1e3"], ["--deadline", "soon"]):
+        with pytest.raises(SystemExit):
+            run("run", "two-nodes", *words)
+        assert f"{words[1]} is not a" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run("design", "--help")
+    helped = capsys.readouterr().out
+    assert all(f"{method} " in helped or f"{method}:" in helped for method in METHODS)
     assert run("design", "two-nodes", "--method", "magic", "-o", "never.json") == 2
     assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
     assert not Path("never.json").exists()

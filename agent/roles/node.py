@@ -39,8 +39,8 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
                 _put(inbox, modes.next())
             while (sender := inbox.lacking) is not None:
                 _put(inbox, estimates[sender].next())
-            mode, heard = inbox.mode, list(inbox.heard)
-            x_hat = step(own, mode, inbox.heard)
+            mode, pairs = inbox.mode, inbox.heard
+            x_hat, heard = step(own, mode, pairs), list(pairs)
             inbox.next_step()
             for sender in estimates.keys() - set(heard):  # whom this mode does not hear must not pile up
                 for sample in estimates[sender].waiting():

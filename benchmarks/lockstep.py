@@ -1,0 +1,165 @@
+"""The real run beside the same run over raw AF_UNIX sockets, in one invocation.
+
+    python benchmarks/lockstep.py [--steps 3000] [--repeat 3] [GAINS]
+
+Prints rounds per second as medians, the ratio to both orders of the reference, CPU time and context switches per round
+of every process, resident memory, and the seconds from the start of the command to step 0. The estimates of all runs
+must be the same, bit for bit, or there is nothing to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import unix_sockets
+
+from agent.contract.gains import Gains
+from agent.contract.messages import estimate
+from agent.contract.recording import RecordingReader
+
+GOLDEN = Path(__file__).parents[1] / "recordings" / "golden" / "zhu2020-lossy.gains.json"
+SEED = 1
+TICK = os.sysconf("SC_CLK_TCK")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("gains", nargs="?", type=Path, default=GOLDEN)
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--window", type=int, action="append", help="of peakmesh; may be repeated (its default)")
+    options = parser.parse_args()
+    gains = Gains.load(options.gains)
+    rates: dict[str, list[float]] = {}
+    for _ in range(options.repeat):
+        for name, window in (("AF_UNIX, strict", None), ("AF_UNIX, window 32", 32)):
+            rate, digests = unix_sockets.run(gains, steps=options.steps, seed=SEED, window=window)
+            rates.setdefault(name, []).append(rate)
+        for window in options.window or [None]:
+            run = peakmesh(options.gains, gains, options.steps, window)
+            assert run["digests"] == digests, "the runs differ"
+            rates.setdefault("peakmesh" if window is None else f"peakmesh, window {window}", []).append(run["rate"])
+    strict, windowed = (statistics.median(rates[name]) for name in ("AF_UNIX, strict", "AF_UNIX, window 32"))
+    print(f"{'':24} rounds/s   (of {options.repeat}: least, most)   of strict   of windowed AF_UNIX")
+    for name, several in rates.items():
+        rate = statistics.median(several)
+        spread = f"({min(several):.0f}, {max(several):.0f})"
+        print(f"{name:24} {rate:8.0f}   {spread:>24}   {rate / strict:9.2f}   {rate / windowed:9.2f}")
+    print(f"\nthe last peakmesh run: step 0 after {run['start_seconds']:.2f} s; per round")
+    for who, use in run["use"].items():
+        print(
+            f"  {who:14} {use['user']:5.0f} us user {use['system']:5.0f} us system {use['switches']:6.1f} waits"
+            f"   {use['megabytes_at_first']:4.0f} MB resident at first, {use['megabytes']:.0f} MB at last"
+        )
+
+
+def peakmesh(path: Path, gains: Gains, steps: int, window: int | None) -> dict[str, Any]:
+    """One real run: its rate, what its processes used, and a digest of each node's estimates."""
+    with tempfile.TemporaryDirectory() as folder:
+        recording = Path(folder) / "run.mcap"
+        command = [sys.executable, "-m", "agent", "run", str(path), "--json", "-o", str(recording)]
+        command += ["--steps", str(steps), "--seed", str(SEED)]
+        command += [] if window is None else ["--window", str(window)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        watcher = Watcher(process.pid, recording.with_name("run.mcap.part"))
+        watcher.start()
+        printed, _ = process.communicate()
+        watcher.join()
+        facts = json.loads(printed)
+        return {
+            "rate": facts["rounds_per_second"],
+            "start_seconds": facts["start_seconds"],
+            "use": watcher.use(steps),
+            "digests": digests(recording, gains),
+        }
+
+
+def digests(recording: Path, gains: Gains) -> dict[str, str]:
+    """Of each node's estimates, in the order of their steps."""
+    found = {estimate(name): hashlib.sha256() for name in gains.problem.node_names}
+    with RecordingReader(recording) as reader:
+        for message in reader.messages():
+            if message.topic in found:
+                found[message.topic].update(message.payload)
+    return {name: found[estimate(name)].hexdigest() for name in gains.problem.node_names}
+
+
+class Watcher(threading.Thread):
+    """Reads /proc of a launcher's children, from the start of the recording to its end."""
+
+    def __init__(self, launcher: int, part: Path) -> None:
+        super().__init__()
+        self._launcher, self._part = launcher, part
+        self._first: dict[str, list[float]] = {}
+        self._last: dict[str, list[float]] = {}
+
+    def run(self) -> None:
+        while not self._part.exists():
+            time.sleep(0.005)
+        while self._part.exists():
+            seen = {who: counts for pid in self._children() if (who := role(pid)) and (counts := counted(pid))}
+            self._first = {**seen, **self._first}
+            self._last |= seen
+            time.sleep(0.1)
+
+    def use(self, steps: int) -> dict[str, dict[str, float]]:
+        """Per round, of each process."""
+        found = {}
+        for who, last in sorted(self._last.items()):
+            user, system, switches = (1e6 * (b - a) / steps for a, b in zip(self._first[who], last[:3], strict=False))
+            found[who] = {
+                "user": user,
+                "system": system,
+                "switches": switches / 1e6,
+                "megabytes_at_first": self._first[who][3],
+                "megabytes": last[3],
+            }
+        return found
+
+    def _children(self) -> list[int]:
+        try:
+            text = Path(f"/proc/{self._launcher}/task/{self._launcher}/children").read_text()
+        except OSError:
+            return []
+        return [int(pid) for pid in text.split()]
+
+
+def role(pid: int) -> str:
+    """`node 3`, `plant`, ... from a command line."""
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+    except OSError:
+        return ""
+    name = words[words.index("--node") + 1] if "--node" in words else ""
+    return f"{words[words.index('agent') + 1]} {name}".strip() if "agent" in words else ""
+
+
+def counted(pid: int) -> list[float]:
+    """CPU seconds (user, system), voluntary context switches of all threads, resident megabytes."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        tasks = [Path(f"/proc/{pid}/task/{task}/status").read_text() for task in os.listdir(f"/proc/{pid}/task")]
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return []
+    switches = sum(_field(text, "voluntary_ctxt_switches") for text in tasks)
+    return [int(stat[11]) / TICK, int(stat[12]) / TICK, switches, _field(status, "VmRSS") / 1024]
+
+
+def _field(status: str, name: str) -> int:
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith(name + ":"))
+
+
+if __name__ == "__main__":
+    main()
