@@ -129,6 +129,7 @@ class Bus:
         self._early: list[Incoming] = []  # what came while we waited for something else
         self._alone = True
         self._present: set[str] = set()  # whose token is there
+        self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._session = _open(network)
         self._handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -251,6 +252,7 @@ class Bus:
     # End together.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
         """Samples that are still to come, until everybody in `whos` has answered a request for replay."""
+        self._leaving = True
         waiting = set(whos)
         deadline = time.monotonic() + CLOSE_SECONDS
         while waiting and time.monotonic() < deadline:
@@ -262,6 +264,7 @@ class Bus:
 
     def wait_for_close(self, timeout: float = CLOSE_SECONDS) -> Acknowledged | None:
         """Answer replays until the recorder has closed the recording; None where it did not say so in time."""
+        self._leaving = True
         deadline = time.monotonic() + timeout
         while self._last_word is None and RECORDER in self._present and time.monotonic() < deadline:
             self._take(deadline)
@@ -269,6 +272,7 @@ class Bus:
 
     def wait_for_leave(self, who: str) -> None:
         """Stay until `who` has gone, so that our last word is sure to reach them; not for longer than a moment."""
+        self._leaving = True
         deadline = time.monotonic() + CLOSE_SECONDS
         while who in self._present and time.monotonic() < deadline:
             self._take(deadline)
@@ -363,8 +367,12 @@ class Bus:
         who = topic_of(str(sample.key_expr)).removeprefix(alive(""))
         self._queue.put(lambda: Peer(who, sample.kind == zenoh.SampleKind.PUT))
 
+    def _interrupt(self, number: int) -> None:
+        if not self._leaving:
+            raise Interrupted(number)
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._queue.put(lambda: _raise(Interrupted(number)))
+        self._queue.put(lambda: self._interrupt(number))
 
 
 def _raise(error: BaseException) -> None:
