@@ -173,9 +173,10 @@ class Bus:
         absent = set(others) - {self.who}
         deadline = time.monotonic() + self.network.wait
         while absent:
-            peer = self._wait_for(Peer, deadline=deadline, missing=absent)
-            absent.discard(peer.who)
-            yield peer.who
+            who = self._wait_for(Peer, deadline=deadline, missing=absent).who
+            if who in absent:
+                absent.remove(who)
+                yield who
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
         """The coordinator's: wait until everybody has met everybody."""

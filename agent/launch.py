@@ -170,7 +170,8 @@ class _Crew:
         self._end_run(number)
 
     def _on_exit(self, number: int, frame: FrameType | None) -> None:
-        if self.started or self._failed is not None or self._children[COORDINATOR].process.poll() is not None:
+        coordinator = self._children.get(COORDINATOR)
+        if self.started or self._failed is not None or coordinator is None or coordinator.process.poll() is not None:
             return
         for who, child in self._children.items():
             if who != COORDINATOR and child.process.poll() not in (None, 0):

@@ -45,10 +45,6 @@ class Ledger:
         there = self._there.get(self.complete, set())
         return [topic for topic in self._topics if topic not in there]
 
-    def gaps(self) -> list[str]:
-        """The senders of whom something is missing before what is there."""
-        return [sender for sender, numbers in self._early.items() if numbers]
-
     def missing(self, sender: str) -> int:
         """How many messages of a sender are missing before the last one of theirs that is there."""
         early = self._early.get(sender)

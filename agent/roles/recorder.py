@@ -129,8 +129,8 @@ class Recorder:
             self._say(lacking=[], closed=closed)
 
     def _complain(self) -> None:
-        """Nothing has come for a while: ask for what fell into gaps, and say what is missing."""
-        for who in self._ledger.gaps():
+        """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
+        for who in self._publishers:
             self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
         self._say(lacking=self._ledger.lacking(), closed=False)
         self._last_write = time.monotonic()
