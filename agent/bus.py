@@ -243,10 +243,9 @@ class Bus:
             self._queue.put(lambda: _replayed(reply))
 
         self._session.get(
-            f"{key(self.run, replay(who))}?from={first}",
+            f"{key(self.run, replay(who))}?from={first};_anyke",  # answers come under their own keys
             zenoh.handlers.Callback(answer, lambda: self._queue.put(lambda: Replayed(who))),
             consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=CLOSE_SECONDS,
         )
 
