@@ -3,9 +3,11 @@
 The only module that imports zenoh. What makes it lose nothing:
 
 * the start barrier: everybody declares what it receives, then a liveliness token, then waits for all tokens.
-  Declarations keep their order on a link, so whoever sees a token knows that peer's subscriptions;
-* every data message is numbered and kept until the recorder has acknowledged it, and can be asked for again;
-* nobody leaves before the recorder has closed the recording.
+  Every two peers have a link of their own, and declarations keep their order on a link, so whoever sees a token
+  knows that peer's subscriptions;
+* every data message is numbered and kept until the recorder has acknowledged it, and the recorder can ask for it
+  again;
+* when a run ends, nobody who is well leaves before the recorder has closed the recording.
 """
 
 from __future__ import annotations
@@ -22,8 +24,9 @@ from types import FrameType, TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
 import zenoh
+from pydantic import ValidationError
 
-from agent.contract.errors import InputError, Interrupted, RunBroken
+from agent.contract.errors import InputError, Interrupted, RunBroken, first_fault
 from agent.contract.messages import (
     ACKNOWLEDGED,
     CONTROL,
@@ -41,11 +44,14 @@ from agent.contract.messages import (
     replay,
     topic_of,
 )
+from agent.plan import LARGEST_WINDOW
 
 LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
 BUFFER = 16_384  # bytes, of each direction of each link; messages are small, links are many
-CAPACITY = 8192  # messages that a channel holds; far more than a window lets come
-CLOSE_SECONDS = 1.5  # how long a leaving participant waits for the recorder's last word
+CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
+REPLAY_SECONDS = 1.0  # how long the recorder waits for what it asks for at the end
+CLOSE_SECONDS = 10.0  # how long everybody else waits for the recorder to close, as long as it is there
+LEAVE_SECONDS = 1.0  # how long one waits for the others to have gone
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ class Sample(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A participant that has come or gone."""
+    """Somebody who has come or gone."""
 
     who: str
     present: bool
@@ -127,7 +133,8 @@ class Bus:
         self._kept: deque[tuple[Stamp, str, bytes]] = deque()  # what the recorder has not acknowledged
         self._published = 0
         self._early: list[Incoming] = []  # what came while we waited for something else
-        self._alone = True
+        self._alone = True  # nobody else of this run has been seen
+        self._expected: set[str] = set()  # who takes part
         self._present: set[str] = set()  # whose token is there
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
@@ -170,7 +177,8 @@ class Bus:
     # Start together.
     def meet(self, others: Iterable[str]) -> Iterator[str]:
         """Wait for everybody's token, and yield who has come; RunBroken names who is missing when time is over."""
-        absent = set(others) - {self.who}
+        self._expected = set(others) - {self.who}
+        absent = set(self._expected)
         deadline = time.monotonic() + self.network.wait
         while absent:
             who = self._wait_for(Peer, deadline=deadline, missing=absent).who
@@ -179,19 +187,20 @@ class Bus:
                 yield who
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
-        """The coordinator's: wait until everybody has met everybody."""
+        """The coordinator's: wait until everybody has met everybody. InputError where a name is there twice."""
         answers: dict[str, Ready] = {}
         unready = set(others) - {self.who}
         deadline = time.monotonic() + self.network.wait
         while unready:
             answer = self._wait_for(Ready, deadline=deadline, missing=unready)
-            answers[answer.who] = answer
+            if answers.setdefault(answer.who, answer).session != answer.session:
+                raise InputError(f"{in_words(answer.who)} takes part twice; start it once")
             unready.discard(answer.who)
         return answers
 
     def report_ready(self, gains: str) -> None:
         """Tell the coordinator that we have met everybody, and which gains we run on."""
-        self._put(ready(self.who), Ready(who=self.who, gains=gains))
+        self._put(ready(self.who), Ready(who=self.who, session=str(self._session.zid()), gains=gains))
 
     def wait_for_start(self) -> Control:
         """The coordinator's order to start, with the facts of the run."""
@@ -217,7 +226,7 @@ class Bus:
         while True:
             item = self._early.pop(0) if self._early else self._take(deadline)
             match item:
-                case Control():
+                case Control(order="close" | "stop"):
                     raise RunClosed(item)
                 case Peer(who="coordinator", present=False):
                     raise RunBroken("the coordinator was lost: its process ended, or the network to it failed")
@@ -246,7 +255,7 @@ class Bus:
             f"{key(self.run, replay(who))}?from={first};_anyke",  # answers come under their own keys
             zenoh.handlers.Callback(answer, lambda: self._queue.put(lambda: Replayed(who))),
             consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
-            timeout=CLOSE_SECONDS,
+            timeout=REPLAY_SECONDS,
         )
 
     # End together.
@@ -254,7 +263,7 @@ class Bus:
         """Samples that are still to come, until everybody in `whos` has answered a request for replay."""
         self._leaving = True
         waiting = set(whos)
-        deadline = time.monotonic() + CLOSE_SECONDS
+        deadline = time.monotonic() + REPLAY_SECONDS
         while waiting and time.monotonic() < deadline:
             match self._take(deadline):
                 case Sample() as sample:
@@ -262,19 +271,20 @@ class Bus:
                 case Replayed(who=who):
                     waiting.discard(who)
 
-    def wait_for_close(self, timeout: float = CLOSE_SECONDS) -> Acknowledged | None:
-        """Answer replays until the recorder has closed the recording; None where it did not say so in time."""
-        self._leaving = True
-        deadline = time.monotonic() + timeout
-        while self._last_word is None and RECORDER in self._present and time.monotonic() < deadline:
-            self._take(deadline)
+    def wait_for_close(self) -> Acknowledged | None:
+        """Answer replays until the recorder has closed the recording; None where it has not."""
+        self._until(lambda: self._last_word is not None or RECORDER not in self._present, seconds=CLOSE_SECONDS)
         return self._last_word
 
-    def wait_for_leave(self, who: str) -> None:
-        """Stay until `who` has gone, so that our last word is sure to reach them; not for longer than a moment."""
+    def wait_until_gone(self, whos: Iterable[str]) -> None:
+        """Stay until they have gone, so that our last word is sure to have reached them; but not for long."""
+        names = set(whos)
+        self._until(lambda: not names & self._present, seconds=LEAVE_SECONDS)
+
+    def _until(self, condition: Callable[[], bool], *, seconds: float) -> None:
         self._leaving = True
-        deadline = time.monotonic() + CLOSE_SECONDS
-        while who in self._present and time.monotonic() < deadline:
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
             self._take(deadline)
 
     def locators(self) -> list[str]:
@@ -290,11 +300,13 @@ class Bus:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for declared in reversed(self._declared):  # the token first: the others see us go
-            declared.undeclare()
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
-        self._session.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
+        try:
+            for declared in reversed(self._declared):  # the token first: the others see us go
+                declared.undeclare()
+        finally:
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
 
     # Inside.
     def _take(self, deadline: float) -> Incoming | None:
@@ -324,17 +336,20 @@ class Bus:
             if isinstance(early, kind):
                 self._early.remove(early)
                 return early
+        left = ""  # who went away; the coordinator's word on it may be on its way
         while True:
             item = self._take(deadline)
             if item is None:
                 if time.monotonic() >= deadline:
-                    raise RunBroken(self._who_is_missing(missing))
+                    raise RunBroken(left or self._who_is_missing(missing))
                 continue
             match item:
                 case Control(order="close" | "stop"):
                     raise RunClosed(item)
-                case Peer(who=who, present=False):
-                    raise RunBroken(f"{in_words(who)} left before the run had started")
+                case Peer(who=who, present=False) if who in self._expected:
+                    left = left or f"{in_words(who)} left before the run had started"
+                    deadline = min(deadline, time.monotonic() + (0.0 if self.who == COORDINATOR else LEAVE_SECONDS))
+                    continue
             if isinstance(item, kind):
                 return item
             self._early.append(item)
@@ -342,20 +357,32 @@ class Bus:
     def _who_is_missing(self, missing: set[str]) -> str:
         if self._alone and self.network.connect:
             where = ", ".join(self.network.connect)
-            return f"nobody answered at {where} within {self.network.wait:g} s; is the coordinator running there?"
+            return (
+                f'nobody of run "{self.run}" answered at {where} within {self.network.wait:g} s; '
+                "is the coordinator running there, under the same --run?"
+            )
         names = " and ".join(map(in_words, sorted(missing)))
         return f"{names} did not join the run within {self.network.wait:g} s"
 
     def _replay(self, query: zenoh.Query) -> None:
-        first = int(query.parameters.get("from") or 0)
+        first = query.parameters.get("from") or ""
         with query:
+            if not first.isdecimal() or "_anyke" not in query.parameters:
+                return  # not the recorder's question
             for stamp, topic, payload in tuple(self._kept):
-                if stamp.number >= first:
+                if stamp.number >= int(first):
                     query.reply(key(self.run, topic), payload, attachment=stamp.encode())
 
     def _listen(self, topic: str, model: type[Control] | type[Acknowledged] | type[Ready]) -> None:
+        def decode(payload: bytes) -> Control | Acknowledged | Ready:
+            try:
+                return model.model_validate_json(payload)
+            except ValidationError as error:
+                fault = first_fault(error, {})
+                raise RunBroken(f"what came on {topic} is not from peakmesh: {fault}") from None
+
         def enqueue(sample: zenoh.Sample) -> None:  # on zenoh's thread; decoded on ours, where a failure is seen
-            self._queue.put(lambda: model.model_validate_json(sample.payload.to_bytes()))
+            self._queue.put(lambda: decode(sample.payload.to_bytes()))
 
         self._declared.append(self._session.declare_subscriber(key(self.run, topic), enqueue))
 

@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
 
-from agent.contract.errors import EXIT_GOOD, EXIT_INTERRUPTED, InputError, PeakmeshError, RunBroken
+from agent.contract.errors import (
+    EXIT_BROKEN,
+    EXIT_GOOD,
+    EXIT_INPUT,
+    EXIT_INTERRUPTED,
+    InputError,
+    PeakmeshError,
+    RunBroken,
+)
+from agent.plan import LARGEST_WINDOW
 
 if TYPE_CHECKING:
     from agent.bus import Network
@@ -52,6 +61,12 @@ def perform(options: argparse.Namespace) -> int:
     except BrokenPipeError:  # the reader of our output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_GOOD
+    except OSError as error:
+        print(f"peakmesh: {error.filename or options.command}: {error.strerror or error}", file=sys.stderr)
+        return EXIT_INPUT
+    except Exception:  # a defect of peakmesh: 1 would mean that the answer is no
+        traceback.print_exc()
+        return EXIT_BROKEN
 
 
 def add_commands(commands: Subcommands) -> None:
@@ -200,7 +215,7 @@ def _plan_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=_count, default=200, metavar="N", help="how many steps (200)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of modes, losses, disturbance (0)")
     parser.add_argument(
-        "--window", type=_count, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
+        "--window", type=_window, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
     )
     parser.add_argument(
         "--deadline", type=_positive, default=10.0, metavar="S", help="a run without progress for so long stops (10)"
@@ -259,6 +274,10 @@ def _count(text: str) -> int:
     return _whole(text, least=1, most=2**31 - 1)
 
 
+def _window(text: str) -> int:
+    return _whole(text, least=1, most=LARGEST_WINDOW)
+
+
 def _seed(text: str) -> int:
     return _whole(text, least=0, most=2**63 - 1)
 
@@ -275,6 +294,9 @@ def _plan(options: argparse.Namespace, gains: Gains) -> Plan:
 
     for name in options.external:
         gains.problem.node_index(name)
+    most = (2**32 - 1) // (gains.problem.n + 1) - 1  # the plant's messages are numbered in 32 bits
+    if options.steps > most:
+        raise InputError(f"--steps {options.steps}: a recording of {gains.problem.n} nodes holds at most {most}")
     return Plan(options.steps, options.seed, options.window, options.deadline, tuple(options.external))
 
 

@@ -23,7 +23,8 @@ from agent.contract.gains import Gains
 from agent.contract.messages import COORDINATOR, PLANT, RECORDER, in_words, node_who
 from agent.plan import Plan
 
-FAREWELL_SECONDS = 1.0  # after the coordinator has gone, the others have so long before they are killed
+RECORDER_SECONDS = 10.0  # after the coordinator has gone, the recorder has so long to close before it is killed
+FAREWELL_SECONDS = 1.0  # after the recorder has gone, the others have so long
 
 
 class Child(NamedTuple):
@@ -75,6 +76,8 @@ def launch(
             report(word)
         crew.wait()
         crew.raise_what_happened()
+    if "steps" not in summary:
+        raise RunBroken("the coordinator ended without a summary")
     return summary
 
 
@@ -105,13 +108,15 @@ class _Crew:
     def start(self, who: str, command: list[str]) -> None:
         said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the crew
         process = subprocess.Popen(
-            [sys.executable, "-m", "agent", *command],
+            [sys.executable, "-P", "-m", "agent", *command],  # -P: no agent.py of the current folder
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if who == COORDINATOR else subprocess.DEVNULL,
             stderr=said,
             start_new_session=True,
         )
         self._children[who] = Child(process, said)
+        if self._signal is not None:  # it came before there was anybody to pass it on to
+            self._end_run(self._signal)
 
     def words_of_coordinator(self) -> Iterator[dict[str, Any]]:
         """The lines of the coordinator's stdout, until it ends."""
@@ -131,14 +136,11 @@ class _Crew:
                     continue
 
     def wait(self) -> None:
-        """Until all have ended; who lingers is killed."""
+        """Until all have ended, the recorder first; who lingers is killed."""
+        _wait_or_kill(self._children[RECORDER].process, RECORDER_SECONDS)
         deadline = time.monotonic() + FAREWELL_SECONDS
         for child in self._children.values():
-            try:
-                child.process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                child.process.kill()
-                child.process.wait()
+            _wait_or_kill(child.process, deadline - time.monotonic())
 
     def raise_what_happened(self) -> None:
         coordinator = self._children[COORDINATOR]
@@ -166,6 +168,9 @@ class _Crew:
         return ""
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._signal is not None:  # asked twice: at once
+            for child in self._children.values():
+                child.process.kill()
         self._signal = self._signal or number
         self._end_run(number)
 
@@ -196,6 +201,14 @@ class _Crew:
                     _close(stream)
         for number, handler in self._before.items():
             signal.signal(number, handler)
+
+
+def _wait_or_kill(process: subprocess.Popen[bytes], seconds: float) -> None:
+    try:
+        process.wait(max(0.0, seconds))
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def _close(stream: IO[bytes]) -> None:

@@ -21,11 +21,6 @@ class Ledger:
         self.received: dict[str, int] = {}  # of each sender, the messages without a gap
         self.reached: dict[str, int] = {}  # of each sender, the last step seen
 
-    @property
-    def topics(self) -> int:
-        """How many messages a step has."""
-        return len(self._topics)
-
     def take(self, topic: str, step: int, stamp: Stamp | None) -> bool:
         """Enter a message; False where it is there already and must not be recorded again."""
         if stamp is not None and not self._number(stamp.sender, stamp.number):

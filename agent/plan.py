@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+LARGEST_WINDOW = 1024  # so that what runs ahead always fits into the channels that wait for it
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -42,7 +42,7 @@ IMPURE = ["time", "datetime", "random", "secrets", "socket", "threading", "async
 
 # Command lines answer at once: before a command is called they import the standard library and these alone.
 LAZY = ["agent/cli.py", "designer/cli.py", "agent/__main__.py", "designer/__main__.py"]
-LIGHT = ["agent.cli", "agent.contract.errors", "agent.contract.files", "designer.cli"]
+LIGHT = ["agent.cli", "agent.plan", "agent.contract.errors", "agent.contract.files", "designer.cli"]
 
 
 def sources() -> dict[str, str]:

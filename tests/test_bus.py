@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from agent.bus import Bus, Network, Peer, RunClosed, Sample
-from agent.contract.errors import Interrupted, RunBroken
+from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.messages import COORDINATOR, MODE, PLANT, RECORDER, Acknowledged, Control, Mode
 
 PATIENCE = 20.0
@@ -53,6 +53,12 @@ def acknowledged(received: int, *, closed: bool = False) -> Acknowledged:
 def answer(publisher: Bus) -> None:
     """Let a publisher answer the request for replay that is on its way: `_take` gives None once it has."""
     while publisher._take(time.monotonic() + PATIENCE) is not None:
+        pass
+
+
+def drain(bus: Bus) -> None:
+    """Take all words, among them the tokens of the barrier, until one of them raises."""
+    while bus.receive(timeout=PATIENCE) is not None:
         pass
 
 
@@ -101,8 +107,7 @@ def test_order_ends_the_run(coordinator: Bus, recorder: Bus) -> None:
     """An order of the coordinator to stop raises RunClosed with its reason."""
     coordinator.order(Control(order="stop", steps=1, seed=0, window=1, external=[], reason="enough"))
     with pytest.raises(RunClosed) as caught:
-        while recorder.receive(timeout=PATIENCE) is not None:  # the tokens of the barrier
-            pass
+        drain(recorder)
     assert caught.value.control.reason == "enough"
 
 
@@ -119,12 +124,11 @@ def test_signals_are_heeded_until_we_leave(coordinator: Bus, recorder: Bus) -> N
     """A signal interrupts whoever is running, and does not cut the closing short."""
     signal.raise_signal(signal.SIGTERM)
     with pytest.raises(Interrupted) as caught:
-        while recorder.receive(timeout=PATIENCE) is not None:
-            pass
+        drain(recorder)
     assert caught.value.exit_code == 143
     recorder.acknowledge(acknowledged(0, closed=True))
     signal.raise_signal(signal.SIGINT)
-    last_word = coordinator.wait_for_close(timeout=PATIENCE)
+    last_word = coordinator.wait_for_close()
     assert last_word is not None
     assert last_word.closed
 
@@ -154,3 +158,32 @@ def test_runs_do_not_hear_each_other(coordinator: Bus) -> None:
         plant.enter()
         with pytest.raises(RunBroken):
             list(plant.meet([COORDINATOR]))
+
+
+@pytest.mark.parametrize("question", ["", "?from=x", "?from=0", "?from=-1;_anyke"])
+def test_a_question_that_is_not_the_recorders_is_ignored(coordinator: Bus, recorder: Bus, question: str) -> None:
+    """Anybody may look at the keys of a run without ending it."""
+    publish(coordinator, range(3))
+    asked = recorder._session.get(f"peakmesh/test/replay/{COORDINATOR}{question}", timeout=PATIENCE)
+    answer(coordinator)
+    assert list(asked) == []
+
+
+@pytest.mark.parametrize("payload", [b"hello", b"{}", b'{"order": "dance"}'])
+def test_a_foreign_word_of_control_is_one_sentence(coordinator: Bus, recorder: Bus, payload: bytes) -> None:
+    """What peakmesh did not send on a key of control breaks the run with a sentence, not with a traceback."""
+    coordinator._session.put("peakmesh/test/control", payload)
+    with pytest.raises(RunBroken, match="what came on control is not from peakmesh: "):
+        drain(recorder)
+
+
+def test_a_name_that_is_there_twice_is_refused(coordinator: Bus) -> None:
+    """Two participants of one name would publish the same topic; the coordinator refuses the second."""
+    network = Network(connect=(coordinator.locators()[0],), wait=PATIENCE)
+    with Bus(network, run="test", who=PLANT) as first, Bus(network, run="test", who=PLANT) as second:
+        for bus in (first, second):
+            bus.enter()
+            list(bus.meet([COORDINATOR]))
+            bus.report_ready("gains")
+        with pytest.raises(InputError, match="the plant takes part twice; start it once"):
+            coordinator.gather([PLANT, RECORDER])

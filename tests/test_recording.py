@@ -343,10 +343,10 @@ def test_others_can_read_what_is_older_than_the_promise(tmp_path: Path, monkeypa
         assert read(part).messages == []
         writer.add(MESSAGES[0])
         now += 0.4 * FLUSH_SECONDS
-        assert writer.flush_when_due() == pytest.approx(0.6 * FLUSH_SECONDS)
+        writer.flush_when_due()
         assert read(part).messages == []
         now += 0.6 * FLUSH_SECONDS + 1e-6
-        assert writer.flush_when_due() == pytest.approx(FLUSH_SECONDS)
+        writer.flush_when_due()
         assert read(part).messages == MESSAGES[:1]
         writer.add(MESSAGES[1])
         now += 10.0 * FLUSH_SECONDS

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from runs import (
     answer,
     child,
@@ -54,14 +55,15 @@ def run_here(
     *,
     at: int = 0,
     do: Callable[[], None] = lambda: None,
-    wait: float = 60.0,
+    heed: Callable[[dict[str, Any]], None] = lambda word: None,
     **plan: Any,
 ) -> dict[str, Any]:
-    """Launch a run from this process, and call `do` once `at` steps are complete."""
+    """Launch a run from this process, call `do` once `at` steps are complete; `heed` gets every word."""
     done = False
 
     def report(word: dict[str, Any]) -> None:
         nonlocal done
+        heed(word)
         if word.get("complete", 0) > at and not done:
             done = True
             do()
@@ -73,7 +75,7 @@ def run_here(
         run="test",
         recording=recording,
         force=False,
-        wait=wait,
+        wait=60.0,
         report=report,
     )
 
@@ -263,6 +265,44 @@ def test_frozen_node_is_named_after_the_deadline(gains_path: Path, tmp_path: Pat
     assert children(os.getpid()) == {}
 
 
+def test_garbage_on_a_topic_ends_the_run_in_order(gains_path: Path, tmp_path: Path) -> None:
+    """A foreign message among the data: exit 3, one sentence that says where, and the recording is closed."""
+    recording = tmp_path / "run.mcap"
+    address = ""
+
+    def garbage() -> None:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", f'["{address}"]')
+        config.insert_json5("listen/endpoints", '["tcp/127.0.0.1:0"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as session:
+            publisher = session.declare_publisher("peakmesh/test/event")
+            while not publisher.matching_status.matching:
+                time.sleep(0.01)
+            for _ in range(3):
+                publisher.put(b"hello")
+
+    def listen(word: dict[str, Any]) -> None:
+        nonlocal address
+        address = word["listening"][0] if "listening" in word else address
+
+    with pytest.raises(RunBroken, match="a message on event is not a Event: "):
+        run_here(gains_path, recording, at=20, do=garbage, heed=listen)
+    end = end_of(recording)
+    assert end is not None
+    assert end["status"] == "broken"
+
+
+def test_files_of_the_current_folder_are_not_imported(
+    gains_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent.py or queue.py that happens to lie where the run is started has no part in it."""
+    for name in ("agent.py", "queue.py"):
+        (tmp_path / name).write_text("raise SystemExit('imported')\n")
+    monkeypatch.chdir(tmp_path)
+    assert run_here(gains_path, tmp_path / "run.mcap", steps=5)["missing"] == 0
+
+
 # Sensors of one's own.
 def test_sensor_of_ones_own(gains_path: Path, tmp_path: Path, gains: Gains) -> None:
     """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
@@ -310,9 +350,12 @@ def test_other_gains_are_refused(gains_path: Path, tmp_path: Path, gains: Gains)
         files = {name: other if name == names[1] else gains_path for name in names}
         there = [started("node", files[name], "--node", name, "--connect", address) for name in names]
         recorder = started("recorder", gains_path, "-o", tmp_path / "run.mcap", "--connect", address)
-        with there[0], there[1], there[2], started("plant", gains_path, "--connect", address), recorder:
+        plant = started("plant", gains_path, "--connect", address)
+        with there[0] as a, there[1] as b, there[2] as c, plant as d, recorder as e:
             said = line_with(coordinator, "peakmesh: ")
             assert coordinator.wait(60) == 2
+            assert [line_with(process, "peakmesh: ") for process in (a, b, c, d, e)] == [said] * 5
+            assert [process.wait(60) for process in (a, b, c, d, e)] == [3] * 5
     assert f'node "{names[1]}" runs on other gains' in said
     assert not (tmp_path / "run.mcap").exists()
 
@@ -332,7 +375,8 @@ def test_nobody_listens(gains_path: Path, gains: Gains) -> None:
     done = peakmesh("node", gains_path, "--node", name, "--connect", "tcp/127.0.0.1:1", "--wait", "0.5")
     assert done.returncode == 3
     assert done.stderr == (
-        "peakmesh: nobody answered at tcp/127.0.0.1:1 within 0.5 s; is the coordinator running there?\n"
+        f'peakmesh: nobody of run "{gains.problem.name}" answered at tcp/127.0.0.1:1 within 0.5 s; '
+        "is the coordinator running there, under the same --run?\n"
     )
 
 

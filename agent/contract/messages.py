@@ -30,8 +30,9 @@ from __future__ import annotations
 import struct
 from typing import Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from agent.contract.errors import RunBroken, first_fault
 from agent.contract.problem import Problem
 
 
@@ -96,9 +97,10 @@ class Event(Message):
 
 
 class Ready(BaseModel):
-    """`who` has seen everybody's token; `gains` is the digest of the gains it runs on."""
+    """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains."""
 
     who: str
+    session: str
     gains: str
 
 
@@ -182,6 +184,17 @@ def model_of(topic: str) -> type[Message] | None:
         case ["event"]:
             return Event
     return None
+
+
+def decode(topic: str, payload: bytes) -> Message:
+    """A message of a known topic. Raises RunBroken: one sentence that says what came there."""
+    model = model_of(topic)
+    if model is None:
+        raise RunBroken(f"there is no topic {topic}")
+    try:
+        return model.decode(payload)
+    except ValidationError as error:
+        raise RunBroken(f"a message on {topic} is not a {model.__name__}: {first_fault(error, {})}") from None
 
 
 def key(run: str, topic: str) -> str:

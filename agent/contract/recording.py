@@ -104,8 +104,8 @@ class RecordingWriter:
         with self._writing():
             self._writer.add_message(channel, message.log_time, message.payload, message.publish_time, message.number)
 
-    def flush_when_due(self) -> float:
-        """Flush and sync as often as promised; returns the seconds until it is due again."""
+    def flush_when_due(self) -> None:
+        """Flush and sync as often as promised."""
         now = time.monotonic()
         if now - self._flushed >= FLUSH_SECONDS:
             with self._writing():
@@ -114,7 +114,6 @@ class RecordingWriter:
                 if now - self._synced >= SYNC_SECONDS:
                     os.fsync(self._file.fileno())
                     self._synced = now
-        return self._flushed + FLUSH_SECONDS - now
 
     def finish(self, end: dict[str, str]) -> None:
         """Write `end`, the index, and give the file its name."""

@@ -83,17 +83,17 @@ class Conductor:
     def __init__(self, bus: Bus, gains: Gains, plan: Plan, report: Callable[[Word], None]) -> None:
         self._bus, self._gains, self._plan, self._report = bus, gains, plan, report
         self._reported = 0.0
+        self._everybody = [who for who in participants(gains.problem) if who != bus.who]
         self.complete = 0  # steps that the recorder holds
         self._lacking: list[str] = []
         self._started = False
 
     def start(self) -> None:
         """The barrier, and the order to start."""
-        everybody = participants(self._gains.problem)
         self._bus.enter()
-        for who in self._bus.meet([*everybody, *map(sensor_who, self._plan.external)]):
+        for who in self._bus.meet([*self._everybody, *map(sensor_who, self._plan.external)]):
             self._report({"joined": who})
-        for who, ready in self._bus.gather(everybody).items():
+        for who, ready in self._bus.gather(self._everybody).items():
             if ready.gains != self._gains.digest():
                 raise InputError(
                     f"{in_words(who)} runs on other gains ({ready.gains[:12]}...) than the coordinator "
@@ -118,9 +118,9 @@ class Conductor:
         """All is done: the recorder closes the recording, then everybody leaves."""
         self._announce("end", "all steps are done")
         self._order("close")
-        last_word = self._bus.wait_for_close(timeout=self._plan.deadline)
+        last_word = self._bus.wait_for_close()
         if last_word is None:
-            raise RunBroken(f"the recorder did not close the recording within {self._plan.deadline:g} s")
+            raise RunBroken("all steps are done, but the recorder did not close the recording")
         return last_word
 
     def stop(self, reason: str) -> Acknowledged | None:
@@ -128,7 +128,10 @@ class Conductor:
         if self._started:
             self._announce("stop", reason)
         self._order("stop", reason)
-        return self._bus.wait_for_close() if self._started else None
+        if self._started:
+            return self._bus.wait_for_close()
+        self._bus.wait_until_gone(self._everybody)
+        return None
 
     def _order(self, order: Literal["start", "close", "stop"], reason: str = "") -> None:
         plan = self._plan
@@ -157,11 +160,14 @@ class Conductor:
                 case Acknowledged(steps=steps, lacking=lacking):
                     self.complete, self._lacking = steps, lacking
                     recorder_speaks = True
-                case Peer(who=who, present=False):
+                case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who)
         if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._report({"complete": self.complete})
+
+    def _takes_part(self, who: str) -> bool:
+        return who in self._everybody or who in map(sensor_who, self._plan.external)
 
     def _what_is_late(self, recorder_speaks: bool) -> str:
         if not recorder_speaks:

@@ -14,10 +14,13 @@ from agent.contract.messages import Control, participants
 def join(bus: Bus, gains: Gains) -> Control:
     """Enter, meet everybody, say so, and wait for the start. Topics must be declared before."""
     bus.enter()
-    for _ in bus.meet(participants(gains.problem)):
-        pass
-    bus.report_ready(gains.digest())
-    return bus.wait_for_start()
+    try:
+        for _ in bus.meet(participants(gains.problem)):
+            pass
+        bus.report_ready(gains.digest())
+        return bus.wait_for_start()
+    except RunClosed as closed:
+        raise RunBroken(closed.control.reason) from None
 
 
 def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from agent.bus import Bus, Sample
 from agent.contract.arrays import Array
-from agent.contract.errors import RunBroken, first_fault
+from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
-from agent.contract.messages import MODE, Control, Estimate, estimate, measurement, model_of
+from agent.contract.messages import MODE, Control, Estimate, decode, estimate, measurement
 from agent.filter import innovation, step
 from agent.inbox import Inbox
 from agent.roles.joining import take_part
@@ -64,12 +64,8 @@ def _sent(own: NodeGains, k: int, x_hat: Array, y: Array, mode: str, heard: list
 
 
 def _put(inbox: Inbox, sample: Sample) -> None:
-    model = model_of(sample.topic)
-    assert model is not None  # only topics of the table are subscribed to
     sender = sample.topic.split("/")[1] if sample.topic != MODE else ""
     try:
-        inbox.put(sender, model.decode(sample.payload))
-    except ValidationError as error:
-        raise RunBroken(f"a message on {sample.topic} is not a {model.__name__}: {first_fault(error, {})}") from None
+        inbox.put(sender, decode(sample.topic, sample.payload))
     except ValueError as error:
         raise RunBroken(f"a message on {sample.topic} cannot be used: {error}") from None

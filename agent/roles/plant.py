@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from agent.bus import Bus
+from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, Mode, PlantState, measurement
+from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, PlantState, decode, measurement
 from agent.contract.problem import Problem
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.roles.joining import take_part
@@ -21,7 +22,7 @@ def run(bus: Bus, gains: Gains) -> None:
     def work(start: Control) -> None:
         plant = SimulatedPlant(problem, seed=start.seed)
         while True:
-            state, measurements = plant.advance(Mode.decode(modes.next().payload).step)
+            state, measurements = plant.advance(decode(MODE, modes.next().payload).step)
             for name, y in measurements.items():
                 if name not in start.external:
                     bus.publish(measurement(name), y)
@@ -41,8 +42,9 @@ class SimulatedPlant:
         self._step = 0
 
     def advance(self, step: int) -> tuple[PlantState, dict[str, Measurement]]:
-        """The messages of step `step`; the steps must be asked for one after the other."""
-        assert step == self._step
+        """The messages of step `step`; the steps must be asked for one after the other, or RunBroken is raised."""
+        if step != self._step:
+            raise RunBroken(f"the mode of step {step} came where that of step {self._step} was due")
         plant, x = self._problem.plant, self._x
         w, theta = self._disturbance.at(step), self._losses.at(step)
         state = PlantState(

@@ -8,10 +8,8 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from agent.bus import Bus, Channel, RunClosed, Sample
-from agent.contract.errors import Interrupted, RunBroken, first_fault
+from agent.contract.errors import Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import (
     COORDINATOR,
@@ -21,9 +19,9 @@ from agent.contract.messages import (
     PLANT_STATE,
     Acknowledged,
     Control,
+    decode,
     estimate,
     measurement,
-    model_of,
     node_who,
 )
 from agent.contract.recording import Logged, RecordingWriter, refuse_recording
@@ -67,6 +65,7 @@ class Recorder:
         self._ledger = Ledger(gains.problem)
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._acknowledged = 0
+        self._closing = False
         self._last_write = time.monotonic()
 
     def record(self) -> None:
@@ -87,35 +86,37 @@ class Recorder:
         for channel in self._channels:
             for sample in channel.waiting():
                 self._write(sample)
-        if self._ledger.complete - self._acknowledged >= self._quantum or self._ledger.messages == before:
+        new_steps, new_messages = self._ledger.complete - self._acknowledged, self._ledger.messages - before
+        if new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
             self._acknowledge()
-        return self._ledger.messages > before
+        return new_messages > 0
 
     def close(self, *, status: str, reason: str) -> None:
         """Ask everybody for what is missing, end the file, and let everybody go."""
+        self._closing = True
         self._write_waiting()
         for who in self._publishers:
             self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
         for sample in self._bus.replayed(self._publishers):
             self._write(sample)
+        self._write_waiting()  # what came meanwhile
         ledger = self._ledger
         end = {"status": status, "reason": reason, "steps": str(ledger.complete)}
         for who in sorted(ledger.reached):
             end[f"received.{who}"] = str(ledger.received.get(who, 0))
             end[f"reached.{who}"] = str(ledger.reached[who])
-            end[f"missing.{who}"] = str(ledger.missing(who))
+            end[f"missing.{who}"] = str(ledger.missing(who))  # before the last that is there
         self._writer.finish(end)
         self._acknowledge(closed=True)
-        self._bus.wait_for_leave(COORDINATOR)
+        self._bus.wait_until_gone(self._publishers)
 
     def _write(self, sample: Sample) -> None:
-        model = model_of(sample.topic)
-        assert model is not None  # only topics of the table are subscribed to
         try:
-            step = model.decode(sample.payload).step
-        except ValidationError as error:
-            fault = first_fault(error, {})
-            raise RunBroken(f"a message on {sample.topic} is not a {model.__name__}: {fault}") from None
+            step = decode(sample.topic, sample.payload).step
+        except RunBroken:
+            if self._closing:  # no foreign message shall keep the file from being closed
+                return
+            raise
         if not self._ledger.take(sample.topic, step, sample.stamp):
             return
         now = time.time_ns()
@@ -123,19 +124,14 @@ class Recorder:
         self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
         self._last_write = time.monotonic()
 
-    def _acknowledge(self, *, closed: bool = False) -> None:
-        ledger = self._ledger
-        if closed or ledger.complete > self._acknowledged:
-            self._say(lacking=[], closed=closed)
-
     def _complain(self) -> None:
         """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
         for who in self._publishers:
             self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
-        self._say(lacking=self._ledger.lacking(), closed=False)
+        self._acknowledge(lacking=self._ledger.lacking())
         self._last_write = time.monotonic()
 
-    def _say(self, *, lacking: list[str], closed: bool) -> None:
+    def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False) -> None:
         ledger = self._ledger
         self._acknowledged = ledger.complete
         self._bus.acknowledge(
@@ -145,7 +141,7 @@ class Recorder:
                 missing=sum(map(ledger.missing, ledger.reached)),
                 received=ledger.received,
                 reached=ledger.reached,
-                lacking=lacking,
+                lacking=lacking or [],
                 closed=closed,
             )
         )
