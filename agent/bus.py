@@ -455,8 +455,5 @@ def _open(network: Network) -> zenoh.Session:
 
 
 def _why_not_open(network: Network, reason: str) -> str:
-    if "must be of the form" in reason:
-        given = ", ".join([network.listen, *network.connect])
-        return f"an address is wrong in {given}: it must look like tcp/127.0.0.1:7447"
     cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
     return f"cannot listen on {network.listen}: {cause}; port 0 takes a free one"

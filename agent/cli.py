@@ -95,7 +95,9 @@ def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] 
     """The options of `run`, but for what to run; `output` is what --output takes, and its help."""
     _plan_options(parser)
     _output_options(parser, *output)
-    parser.add_argument("--wait", type=_positive, default=30.0, metavar="S", help="how long to wait for all (30)")
+    parser.add_argument(
+        "--wait", type=_positive, default=30.0, metavar="S", help="seconds to wait for all to start (30)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -129,7 +131,8 @@ def run_text(result: dict[str, Any]) -> str:
         f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
         f"{result['missing']} missing\n"
         f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s\n"
-        f"recording  {result['recording']}"
+        f"recording  {result['recording']}\n"
+        f"next       peakmesh replay {result['recording']}"
     )
 
 
@@ -185,8 +188,12 @@ def recorder_command(options: argparse.Namespace) -> int:
 
 def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
     from agent.bus import Bus
+    from agent.contract.messages import in_words
 
-    with Bus(_network(options), run=options.run or gains.problem.name, who=who) as bus:
+    run = options.run or gains.problem.name
+    with Bus(_network(options), run=run, who=who) as bus:
+        if not options.child:
+            print(f'{in_words(who)} waits for everybody of run "{run}"', file=sys.stderr)
         role(bus)
     return EXIT_GOOD
 
@@ -218,7 +225,7 @@ def _plan_options(parser: argparse.ArgumentParser) -> None:
         "--window", type=_window, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
     )
     parser.add_argument(
-        "--deadline", type=_positive, default=10.0, metavar="S", help="a run without progress for so long stops (10)"
+        "--deadline", type=_positive, default=10.0, metavar="S", help="seconds without progress that stop a run (10)"
     )
     parser.add_argument(
         "--external",
@@ -239,12 +246,19 @@ def _network_options(parser: argparse.ArgumentParser) -> None:
         "--run", type=_run_name, metavar="NAME", help="name of the run, the same for everybody (the problem's name)"
     )
     parser.add_argument(
-        "--listen", default="tcp/127.0.0.1:0", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:0)"
+        "--listen",
+        default="tcp/127.0.0.1:0",
+        metavar="ADDRESS",
+        help="where to be reached (tcp/127.0.0.1:0; port 0 takes a free one)",
     )
     parser.add_argument(
-        "--connect", action="append", default=[], metavar="ADDRESS", help="of the coordinator, tcp/127.0.0.1:7447"
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ADDRESS",
+        help="required: of the coordinator, for example tcp/127.0.0.1:7447",
     )
-    parser.add_argument("--wait", type=_positive, default=60.0, metavar="S", help="how long to wait for others (60)")
+    parser.add_argument("--wait", type=_positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
 
 
@@ -312,6 +326,10 @@ def _network(options: argparse.Namespace) -> Network:
         threading.Thread(target=_stop_with_launcher, daemon=True).start()
     elif options.command != "coordinator" and not connect:
         raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
+    for option, addresses in (("--listen", (options.listen,)), ("--connect", connect)):
+        for address in addresses:
+            if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
+                raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
     return Network(options.listen, connect, options.wait)
 
 

@@ -75,7 +75,13 @@ def launch(
                 summary |= word["summary"]
             report(word)
         crew.wait()
-        crew.raise_what_happened()
+        try:
+            crew.raise_what_happened()
+        except RunBroken as error:
+            kept = [path for path in (recording, recording.with_name(recording.name + ".part")) if path.exists()]
+            if crew.started and kept:
+                error.args = (f"{error}; what was recorded is in {kept[0]}",)
+            raise
     if "steps" not in summary:
         raise RunBroken("the coordinator ended without a summary")
     return summary

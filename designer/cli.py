@@ -11,11 +11,12 @@ import json
 import sys
 from collections.abc import Sequence
 from datetime import datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import agent.cli
-from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
+from agent.contract.errors import EXIT_GOOD, EXIT_INPUT, EXIT_NO, InputError
 from agent.contract.files import refuse_overwrite
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Design, run and audit distributed peak-error filters.",
         epilog="Exit codes: 0 good; 1 the answer is no; 2 bad input; 3 the run broke; 130, 143 stopped by a signal.",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parser.add_argument("--version", action="version", version=f"peakmesh {version('peakmesh')}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     _add_demo(commands)
     _add_design(commands)
     _add_verify(commands)
@@ -42,12 +44,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _add_report(commands)
     _add_show(commands)
     agent.cli.add_roles(commands)
-    return agent.cli.perform(parser.parse_args(arguments))
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help(sys.stderr)
+        return EXIT_INPUT
+    return agent.cli.perform(options)
 
 
 # demo
 def _add_demo(commands: agent.cli.Subcommands) -> None:
-    demo = agent.cli.add_command(commands, "demo", demo_command, "design, run, replay and picture an example")
+    demo = agent.cli.add_command(
+        commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)"
+    )
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
     agent.cli.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
 
@@ -128,7 +136,8 @@ def _design_text(result: dict[str, Any]) -> str:
         f"(optimum of the LMI {result['lmi_gamma']:.6f})\n"
         f"{solver['name']} {solver['version']}: {solver['status']}, {solver['iterations']} iterations; "
         f"{result['seconds']['total']:.1f} s in all\n"
-        f"gains      {result['output']}"
+        f"gains      {result['output']}\n"
+        f"next       peakmesh run {result['output']}"
     )
 
 
@@ -149,7 +158,7 @@ def verify_command(options: argparse.Namespace) -> int:
     elif verdict.holds:
         print(f"holds: gamma = {verdict.gamma:.6f} is proved in {verdict.arithmetic}")
     else:
-        print(f"does not hold: {verdict.failure}")
+        print(f"does not hold: gamma = {verdict.gamma:.6f} is not proved for {options.gains}: {verdict.failure}")
     return EXIT_GOOD if verdict.holds else EXIT_NO
 
 
@@ -185,7 +194,7 @@ def _add_replay(commands: agent.cli.Subcommands) -> None:
     replay = agent.cli.add_command(
         commands, "replay", replay_command, "hold a recording against the centralised error model"
     )
-    replay.add_argument("recording", type=Path, metavar="RECORDING", help="MCAP file of a run")
+    replay.add_argument("recording", type=Path, metavar="RECORDING", help="recording, or the .part of one that was cut")
     replay.add_argument("--json", action="store_true", help="print one JSON object")
 
 

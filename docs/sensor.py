@@ -6,17 +6,17 @@ import sys
 
 import zenoh
 
-base, node, address = f"peakmesh/{sys.argv[1]}", sys.argv[2], sys.argv[3]
-config = zenoh.Config()
-config.insert_json5("connect/endpoints", json.dumps([address]))
+base, node, config = f"peakmesh/{sys.argv[1]}", sys.argv[2], zenoh.Config()
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[3]]))
 config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
-    modes, tokens, waiting = queue.SimpleQueue(), queue.SimpleQueue(), {f"node-{node}", "recorder"}
+    modes, tokens, waiting = queue.SimpleQueue(), queue.SimpleQueue(), {f"node-{node}", "recorder", "coordinator"}
     session.declare_subscriber(f"{base}/mode", modes.put)
     session.liveliness().declare_subscriber(f"{base}/alive/*", tokens.put, history=True)
     while waiting:  # whoever is seen here has subscribed before, and will miss nothing
         waiting.discard(str(tokens.get().key_expr).rpartition("/")[2])
+    session.liveliness().declare_subscriber(f"{base}/alive/coordinator", modes.put)  # its end: an empty payload
     ready = session.liveliness().declare_token(f"{base}/alive/sensor-{node}")  # now the run may start
-    while step := modes.get().payload.to_string():  # one mode for each step: read the sensor, publish y
-        y = json.dumps({"step": json.loads(step)["step"], "y": [0.0]})
+    while mode := modes.get().payload.to_string():  # one for each step: read the sensor, publish y
+        y = json.dumps({"step": json.loads(mode)["step"], "y": [0.0]})
         session.put(f"{base}/node/{node}/measurement", y, congestion_control=zenoh.CongestionControl.BLOCK)

@@ -131,7 +131,9 @@ def test_edited_problem(folder: Path, gains: Gains, capsys: pytest.CaptureFixtur
 
 def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
     """Unknown commands, methods and senseless numbers: exit 2."""
-    for words in (["dance"], ["run", "two-nodes", "--steps", "0"], ["run", "two-nodes", "--seed", "-1"], []):
+    assert run() == 2
+    assert "COMMAND" in capsys.readouterr().err
+    for words in (["dance"], ["run", "two-nodes", "--steps", "0"], ["run", "two-nodes", "--seed", "-1"]):
         with pytest.raises(SystemExit) as caught:
             run(*words)
         assert caught.value.code == 2

@@ -47,6 +47,17 @@ def write_whole(path: Path, data: bytes, *, force: bool = False) -> None:
         part.unlink(missing_ok=True)
 
 
+def kind_of(data: bytes) -> str:
+    """What a file seems to be, for a refusal: "a recording", "a gains file", "a problem file", or "" where unknown."""
+    if data.startswith(b"\x89MCAP0"):
+        return "a recording"
+    if data.lstrip().startswith(b"{") and b'"format":"peakmesh-gains"' in data:
+        return "a gains file"
+    if b"[plant]" in data:
+        return "a problem file"
+    return ""
+
+
 def read_bytes(path: Path, *, kind: str) -> bytes:
     """The file's bytes, or an InputError that says why not. `kind` names what was expected of it."""
     try:

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, shape_text
 from agent.contract.errors import InputError, first_fault, listed
-from agent.contract.files import read_bytes, write_whole
+from agent.contract.files import kind_of, read_bytes, write_whole
 from agent.contract.problem import Number, Problem
 
 FORMAT = "peakmesh-gains"
@@ -77,7 +77,10 @@ class Gains(Model):
         try:
             document = json.loads(data)
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{source} is not a gains file: it is not valid JSON: {error}") from None
+            kind = kind_of(data)
+            why = f"it is {kind}" if kind in ("a recording", "a problem file") else f"it is not valid JSON: {error}"
+            hint = f"; design it first: peakmesh design {source}" if kind == "a problem file" else ""
+            raise InputError(f"{source} is not a gains file: {why}{hint}") from None
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise InputError(f'{source} is not a gains file: it does not say "format": "{FORMAT}"')
         if document.get("version") != VERSION:

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from agent.contract.arrays import Array, Matrix, Model, shape_text
 from agent.contract.errors import InputError, counted, first_fault, listed, shortened
-from agent.contract.files import read_bytes
+from agent.contract.files import kind_of, read_bytes
 
 ROW_SUM_TOLERANCE = 1e-9
 
@@ -155,7 +155,9 @@ class Problem(Model):
         try:
             document = tomllib.loads(data.decode())
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not a problem file: it is not valid TOML: {error}") from None
+            kind = kind_of(data)
+            why = f"it is {kind}" if kind in ("a recording", "a gains file") else f"it is not valid TOML: {error}"
+            raise InputError(f"{path} is not a problem file: {why}") from None
         try:
             _read_csv(document, folder=path.parent)
             return cls.from_document(document)
@@ -232,6 +234,7 @@ class Problem(Model):
             return document
         nodes = document.get("node")
         nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+        _refuse_duplicates("node", tuple(nodes))  # before names are looked up among them
         topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]
         return {**document, "topology": topologies}
 
