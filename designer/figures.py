@@ -7,7 +7,7 @@ their figures 5 and 6, the output error of every node, over the norm of all erro
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,13 @@ from matplotlib.ticker import MaxNLocator
 
 from agent.contract.arrays import Array
 from agent.contract.files import refuse_overwrite, write_whole
+from designer.replay.gamma import checked_gamma
 from designer.replay.log import Log, load
 
 # Okabe and Ito 2008, told apart by readers of every colour vision; black is kept for the plant
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MARKERS = "os^Dv<>p"  # hollow, so that nodes whose curves coincide are all seen
+MARKED = 40  # markers on a line at most; where there are more steps, every node has its own
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # tell apart the nodes that share a colour
 BLACK, GREY, PALE = "#1a1a1a", "#707070", "#d9d9d9"
 WIDTH = 7.0  # inches: a page's text
@@ -46,6 +49,8 @@ STYLE = {
     "legend.frameon": False,
     "svg.hashsalt": "peakmesh",
     "axes.formatter.useoffset": False,
+    "axes.autolimit_mode": "round_numbers",  # from tick to tick
+    "axes.ymargin": 0.0,
 }
 
 
@@ -71,13 +76,13 @@ def write(recording: Path, folder: Path, *, force: bool = False) -> list[Path]:
 
 def outputs_figure(log: Log) -> Figure:
     """z and every z_hat_i, a panel for each output; the mode of every step below."""
-    problem, label = log.gains.problem, _node_label(log.gains.problem.n)
+    problem, label = log.gains.problem, _node_label(log.gains.problem.n, r"$\hat{z}$ of node ")
     with matplotlib.rc_context(STYLE):
         figure, panels, strip = _canvas(log, strip_height=0.35 + 0.1 * len(problem.topologies))
         for row, axes in enumerate(panels):
             if log.has_plant:
-                _line(axes, log.z[:, row], colour=BLACK, width=1.9, label="$z$", over=1)
-            for i, style in enumerate(_styles(problem.n)):
+                _line(axes, log.z[:, row], colour=BLACK, width=2.6, label="$z$", over=1)
+            for i, style in enumerate(_styles(problem.n, _shown_steps(log))):
                 _line(axes, log.z_hat[:, i * problem.nz + row], label=label(problem.node_names[i]), **style)
             axes.set_ylabel(_indexed(r"$z$ and $\hat{z}_i$" if log.has_plant else r"$\hat{z}_i$", row, problem.nz))
         _legend(figure, panels[0])
@@ -87,12 +92,12 @@ def outputs_figure(log: Log) -> Figure:
 
 def errors_figure(log: Log) -> Figure:
     """z - z_hat_i of every node, a panel for each output; the norm over all of them below, beside gamma's bound."""
-    problem, label = log.gains.problem, _node_label(log.gains.problem.n)
+    problem, label = log.gains.problem, _node_label(log.gains.problem.n, "node ")
     with matplotlib.rc_context(STYLE):
         figure, panels, strip = _canvas(log, strip_height=1.1)
         for row, axes in enumerate(panels):
             axes.axhline(0.0, color=PALE, linewidth=0.8, zorder=0)
-            for i, style in enumerate(_styles(problem.n)):
+            for i, style in enumerate(_styles(problem.n, _shown_steps(log))):
                 z_tilde = log.z[:, row] - log.z_hat[:, i * problem.nz + row]
                 _line(axes, z_tilde, label=label(problem.node_names[i]), **style)
             axes.set_ylabel(_indexed(r"$z - \hat{z}_i$", row, problem.nz))
@@ -110,18 +115,25 @@ def _canvas(log: Log, *, strip_height: float) -> tuple[Figure, list[Any], Any]:
     *panels, strip = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     for axes in panels:
         axes.tick_params(labelbottom=False)
-        axes.yaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+        axes.yaxis.set_major_locator(MaxNLocator(7, steps=(1, 2, 2.5, 5, 10), min_n_ticks=4))
     shown = _shown_steps(log)
     strip.set_xlim(0, max(1, shown - 1))
     strip.xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10)))
-    rest = (
-        ""
-        if shown >= log.steps
-        else f"   (from here to step {log.steps - 1} all stays below {SETTLED:.0%} of the largest)"
-    )
-    strip.set_xlabel(f"step k{rest}")
+    strip.set_xlabel("step $k$")
+    if shown < log.steps:
+        curves = r"$|z|$ and every $|\hat{z}_i|$" if log.has_plant else r"every $|\hat{z}_i|$"
+        note = f"steps {shown} to {log.steps - 1}, where {curves} stay below {100 * SETTLED:g} % of the largest,"
+        note += "\nare not shown"
+        panels[0].text(1, 1, note, transform=panels[0].transAxes, ha="right", va="top", color=GREY, fontsize=6.5)
+    figure.supxlabel(_caption(log), x=0.99, ha="right", color=GREY, fontsize=6.5)
     figure.align_ylabels()
     return figure, panels, strip
+
+
+def _caption(log: Log) -> str:
+    gamma = checked_gamma(log.gains)
+    proved = f"γ = {gamma.value:.6g}" if gamma.failure is None else "γ is not proved"
+    return f"{log.gains.problem.name}, seed {log.seed}, {proved}"
 
 
 def _shown_steps(log: Log) -> int:
@@ -149,24 +161,19 @@ def _draw_modes(axes: Any, log: Log) -> None:
 
 
 def _draw_norm(axes: Any, log: Log) -> None:
-    """|z_tilde(k)| over all nodes, its peak, and gamma sqrt(sum over j < k of |w(j)|^2)."""
-    z_tilde = np.linalg.norm(np.tile(log.z, log.gains.problem.n) - log.z_hat, axis=1)
-    energies = (np.nan_to_num(log.w) ** 2).sum(axis=1)
-    bound = log.gains.certificate.gamma * np.sqrt(np.cumsum(energies) - energies)
-    _line(
-        axes,
-        bound,
-        colour=GREY,
-        width=0.9,
-        dashes=DASHES[1],
-        label=r"$\gamma\,(\Sigma_{j<k}|w(j)|^2)^{1/2}$, a bound in the mean",
-    )
+    """|z_tilde(k)| over all nodes, its peak, and gamma sqrt(sum over j < k of |w(j)|^2) where gamma is proved."""
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10), min_n_ticks=3))
+    z_tilde, gamma = log.error_norms(), checked_gamma(log.gains)
+    if gamma.failure is None:
+        energies = (np.nan_to_num(log.w) ** 2).sum(axis=1)
+        bound = gamma.value * np.sqrt(np.cumsum(energies) - energies)
+        label = r"$\gamma\,(\Sigma_{j<k}|w(j)|^2)^{1/2}$, a bound in the mean"
+        _line(axes, bound, colour=GREY, width=0.9, dashes=DASHES[1], label=label)
     _line(axes, z_tilde, colour=BLACK, width=1.0, label=r"$|\tilde{z}(k)|$, all nodes")
     if np.isfinite(z_tilde).any():
         k = int(np.nanargmax(z_tilde))
         axes.plot(k, z_tilde[k], "o", color=BLACK, markersize=3.5, label=f"peak {z_tilde[k]:.3g} at step {k}")
     axes.set_ylim(bottom=0.0)
-    axes.yaxis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
     axes.set_ylabel(r"$|\tilde{z}|$")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.98), borderaxespad=0.0, ncols=3, fontsize=7)
 
@@ -180,9 +187,13 @@ def _line(
     dashes: Any = "-",
     label: str,
     over: int = 2,
+    marks: Sequence[int] = (),
     **more: Any,
 ) -> None:
+    """A line over all steps, with markers at the steps `marks` alone."""
     steps, values = thinned(values)
+    if marks:
+        more["markevery"] = np.unique(np.searchsorted(steps[:-1], marks)).tolist()
     axes.plot(steps, values, color=colour, linewidth=width, linestyle=dashes, label=label, zorder=over, **more)
 
 
@@ -199,10 +210,17 @@ def thinned(values: Array) -> tuple[Array, Array]:
     return kept.astype(np.float64), values[kept]
 
 
-def _styles(n: int) -> Iterator[dict[str, Any]]:
-    """How to draw each of n nodes."""
+def _styles(n: int, steps: int) -> Iterator[dict[str, Any]]:
+    """How to draw each of n nodes over so many steps: those that coincide are told apart by markers and widths."""
     raster = {"rasterized": True} if n > RASTER_ABOVE else {}
-    if n <= len(COLOURS) * len(DASHES):
+    if n <= len(MARKERS):
+        every = -(-steps // MARKED)
+        for i, marker in enumerate(MARKERS[:n]):
+            marked = {"marker": marker, "markersize": 4.2, "markerfacecolor": "none", "markeredgewidth": 0.8}
+            marked["marks"] = range(i * every // n, steps, every)
+            dashes, width = DASHES[i // len(COLOURS)], 1.8 - i * 1.1 / max(1, n - 1)
+            yield {"colour": COLOURS[i % len(COLOURS)], "dashes": dashes, "width": width, **marked}
+    elif n <= len(COLOURS) * len(DASHES):
         for i in range(n):
             dashes = DASHES[i // len(COLOURS)]
             yield {"colour": COLOURS[i % len(COLOURS)], "dashes": dashes, **raster}
@@ -212,12 +230,12 @@ def _styles(n: int) -> Iterator[dict[str, Any]]:
             yield {"colour": matplotlib.colors.to_hex(colour), "dashes": dashes, "width": 0.6, **raster}
 
 
-def _node_label(n: int) -> Callable[[str], str]:
-    return "node {}".format if n <= RASTER_ABOVE else str
+def _node_label(n: int, words: str) -> Callable[[str], str]:
+    return words.__add__ if n <= RASTER_ABOVE else str
 
 
 def _legend_columns(n: int) -> int:
-    return 7 if n <= RASTER_ABOVE else 12
+    return 5 if n <= RASTER_ABOVE else 12
 
 
 def _legend(figure: Any, axes: Any) -> None:
@@ -244,5 +262,5 @@ def _rendered(figure: Any, kind: str) -> bytes:
     """The same bytes for the same figure: no date, no random ids."""
     data = io.BytesIO()
     with matplotlib.rc_context(STYLE):
-        figure.savefig(data, format=kind, dpi=200, metadata={"Date": None} if kind == "svg" else None)
+        figure.savefig(data, format=kind, dpi=300, metadata={"Date": None} if kind == "svg" else None)
     return data.getvalue()

@@ -39,9 +39,11 @@ def describe(file: str | Path | None = None) -> dict[str, Any]:
 
 
 def text(facts: dict[str, Any]) -> str:
-    """The same for people: a line for each fact, topics of all nodes taken together."""
+    """The same for people: a line for each fact, topics of all nodes taken together, what gains claim as a claim."""
     if "messages" in facts:
         facts = facts | {"messages": _by_kind(facts["messages"])}
+    if "holds" in facts:
+        facts = _as_claim(facts)
     width = max(map(len, facts)) + 2
     return "\n".join(f"{name.replace('_', ' '):{width}}{_plain(value)}" for name, value in facts.items())
 
@@ -95,6 +97,16 @@ def _gains(gains: Gains) -> dict[str, Any]:
     }
 
 
+def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
+    """Anybody may have edited the file since it was verified: what it says of itself is no verdict."""
+    shown = facts | {"gamma": "not claimed"}
+    if facts["holds"]:
+        command = "verify" if facts["kind"] == "gains" else "replay"
+        shown["gamma"] = f'claimed {facts["gamma"]:.6g}, by design; "peakmesh {command}" checks it'
+    absent = {name for name in ("lmi_gamma", "exact", "floor") if facts.get(name) is None}
+    return {name: value for name, value in shown.items() if name not in {"holds", "verified", *absent}}
+
+
 def _recording(path: Path) -> dict[str, Any]:
     with RecordingReader(path) as reader:
         counts = Counter(logged.topic for logged in reader.messages())
@@ -106,6 +118,7 @@ def _recording(path: Path) -> dict[str, Any]:
         "size": _size(gains.problem),
         "gains": gains.digest(),
         "gamma": gains.certificate.gamma,
+        "holds": gains.certificate.holds,
         "seed": run.get("seed", ""),
         "steps": run.get("steps", ""),
         "complete_steps": end.get("steps"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from designer import figures
 from designer.replay.log import Log, load
 
 STEPS = 50
+GOLDEN = Path(__file__).parent.parent / "recordings" / "golden" / "zhu2020-lossy.mcap"
 
 
 def make(folder: Path, *, ny: tuple[int, ...] = (1, 2, 1, 1), nz: int = 1, steps: int = STEPS) -> Path:
@@ -29,28 +31,75 @@ def lines(axes: object, names: list[str]) -> dict[str, np.ndarray]:
 def test_the_lines_are_the_recording(tmp_path: Path, nz: int) -> None:
     log = load(make(tmp_path, nz=nz))
     names = [f"node {name}" for name in log.gains.problem.node_names]
+    estimates = [rf"$\hat{{z}}$ of {name}" for name in names]
     outputs, errors = figures.outputs_figure(log), figures.errors_figure(log)
     assert len(outputs.axes) == len(errors.axes) == nz + 1
     for row in range(nz):
-        shown = lines(outputs.axes[row], [*names, "$z$"])
+        shown = lines(outputs.axes[row], [*estimates, "$z$"])
         np.testing.assert_array_equal(shown["$z$"], log.z[:, row])
         wrong = lines(errors.axes[row], names)
         assert len(shown) == len(names) + 1
         assert len(wrong) == len(names)
-        for i, name in enumerate(names):
-            np.testing.assert_array_equal(shown[name], log.z_hat[:, i * nz + row])
+        for i, (name, estimate) in enumerate(zip(names, estimates, strict=True)):
+            np.testing.assert_array_equal(shown[estimate], log.z_hat[:, i * nz + row])
             np.testing.assert_array_equal(wrong[name], log.z[:, row] - log.z_hat[:, i * nz + row])
     np.testing.assert_array_equal(outputs.axes[-1].lines[0].get_ydata(), log.mode)
     norms = [line.get_ydata() for line in errors.axes[-1].lines]
-    assert max(norms[1]) == norms[2][0], "the dot is the peak"
+    assert max(norms[0]) == norms[1][0], "the dot is the peak"
+    assert len(norms) == 2, "where gamma is not proved, no bound is drawn"
+
+
+def test_the_bound_is_drawn_where_gamma_is_proved() -> None:
+    log = load(GOLDEN)
+    figure = figures.errors_figure(log)
+    bound, norm, peak = (line.get_ydata() for line in figure.axes[-1].lines)
+    energy = np.square(log.w).sum()
+    assert bound[-1] == pytest.approx(log.gains.certificate.gamma * np.sqrt(energy), rel=1e-6)
+    assert (norm <= bound).all()
+    assert peak[0] == max(norm)
+
+
+def test_the_caption_says_what_is_shown_and_a_note_what_is_not() -> None:
+    log = load(GOLDEN)
+    for figure in (figures.outputs_figure(log), figures.errors_figure(log)):
+        assert figure.get_supxlabel() == "zhu2020-lossy, seed 2020, γ = 0.347992"
+        panel, strip = figure.axes
+        last = round(strip.get_xlim()[1])
+        assert panel.texts[0].get_text().startswith(f"steps {last + 1} to {log.steps - 1}, where")
+        hidden = np.abs(np.hstack([log.z, log.z_hat])[last + 1 :]).max()
+        assert hidden <= 0.01 * np.abs(np.hstack([log.z, log.z_hat])).max()
+
+
+@pytest.mark.parametrize("n", [2, 8])
+def test_nodes_that_coincide_are_told_apart(tmp_path: Path, n: int) -> None:
+    log = load(make(tmp_path, ny=(1,) * n, steps=200))
+    drawn = [line for line in figures.outputs_figure(log).axes[0].lines if line.get_label() != "$z$"]
+    assert len({line.get_marker() for line in drawn}) == n
+    assert all(line.get_linewidth() > after.get_linewidth() for line, after in pairwise(drawn))
+    assert max(len(line.get_markevery()) for line in drawn) <= figures.MARKED
+
+
+def test_ticks_cover_the_curves(tmp_path: Path) -> None:
+    for log in (load(GOLDEN), load(make(tmp_path, nz=3))):
+        for figure in (figures.outputs_figure(log), figures.errors_figure(log)):
+            for axes in figure.axes[:-1]:
+                ticks = axes.get_yticks()
+                values = np.concatenate([line.get_ydata() for line in axes.lines])
+                assert len(ticks) >= 4
+                assert ticks[0] <= values.min() < values.max() <= ticks[-1]
+
+
+def test_the_pictures_of_the_documents_are_small(tmp_path: Path) -> None:
+    assert all(path.stat().st_size < 100_000 for path in figures.write(GOLDEN, tmp_path) if path.suffix == ".svg")
 
 
 def test_every_node_stands_in_the_legend(tmp_path: Path) -> None:
     log = load(make(tmp_path, ny=(1,) * 7))
-    for figure, first in ((figures.outputs_figure(log), ["$z$"]), (figures.errors_figure(log), [])):
-        texts = [text.get_text() for text in figure.legends[0].get_texts()]
-        assert texts == first + [f"node n{i}" for i in range(7)]
-        assert figure.axes[-1].get_xlabel().startswith("step k")
+    nodes = [f"node n{i}" for i in range(7)]
+    estimates = ["$z$", *(rf"$\hat{{z}}$ of {node}" for node in nodes)]
+    for figure, expected in ((figures.outputs_figure(log), estimates), (figures.errors_figure(log), nodes)):
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == expected
+        assert figure.axes[-1].get_xlabel() == "step $k$"
 
 
 @pytest.mark.parametrize(("ny", "steps"), [((1,), 10), ((1,) * 30, 20), ((1, 1), 5000)])

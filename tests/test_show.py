@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from designer import show
 
 GAINS = random_gains(random_problem(3))
 STEPS = 12
+GOLDEN = Path(__file__).parent.parent / "recordings" / "golden" / "zhu2020-lossy.mcap"
 
 
 def test_a_built_in_problem_is_described_by_name_and_by_path() -> None:
@@ -39,7 +41,19 @@ def test_gains_are_described(tmp_path: Path) -> None:
     facts = show.describe(str(path))
     assert (facts["kind"], facts["method"], facts["gamma"], facts["holds"]) == ("gains", "random", 1.0, False)
     assert facts["digest"] == GAINS.digest()
-    assert "none 0: none, 0 iterations" in show.text(facts)
+    text = show.text(facts)
+    assert "none 0: none, 0 iterations" in text
+    assert re.search("gamma +not claimed", text)
+
+
+def test_what_gains_claim_is_shown_as_a_claim(tmp_path: Path) -> None:
+    """Nothing but `verify` can say that it holds: the file may have been edited since."""
+    facts = show.describe(GOLDEN.with_suffix(".gains.json"))
+    assert (facts["holds"], facts["exact"]) == (True, None)
+    text = show.text(facts)
+    assert re.search('gamma +claimed 0.347992, by design; "peakmesh verify" checks it', text)
+    assert not re.search("^(holds|verified|exact|floor)", text, re.MULTILINE)
+    assert 'claimed 0.347992, by design; "peakmesh replay" checks it' in show.text(show.describe(GOLDEN))
 
 
 def test_a_recording_is_described(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A Foxglove layout for a recording of a problem, attached to it: estimates over the truth, errors, modes."""
+"""A Foxglove layout for a recording of a problem, attached to it: estimates over the truth, innovations, modes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from agent.contract.problem import Problem
 
 
 def foxglove_layout(problem: Problem) -> dict[str, Any]:
-    """Two plots and a table: z with every z_hat_i, every innovation, and the raw mode messages."""
+    """Two plots and a table: z with every z_hat_i, the first entry of every innovation, and the raw mode messages."""
     outputs = [f"{PLANT_STATE}.z[{row}]" for row in range(problem.nz)]
     outputs += [f"{estimate(name)}.z_hat[{row}]" for name in problem.node_names for row in range(problem.nz)]
     innovations = [f"{estimate(name)}.innovation[0]" for name in problem.node_names]

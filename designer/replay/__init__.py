@@ -1,10 +1,14 @@
 """A recording against the paper's centralised error model: what was logged, is it what the mathematics says?
 
-1. the logged inputs obey plant, sensors and the seed's draws; every node's own words agree with each other;
+1. modes, losses and disturbance are the seed's, plant and sensors obey them, and so does what each node says of
+   itself;
 2. one step of (10) from the *logged* state gives the next logged errors: names step, node, field, size;
 3. (10) running *freely* from step 0 stays with the log;
 4. every message is there exactly once;
 5. the realised run obeys its path inequality.
+
+Beside these, the certificate of the attached gains is checked again: it decides nothing about the log, but without
+it gamma is only a number in a file.
 
 Replay shares no step arithmetic with the nodes: they sum (4)(5) link by link, here (10) is one matrix of the
 whole network. It never imports the runtime's filter.
@@ -19,9 +23,10 @@ import numpy as np
 
 from agent.contract.problem import Problem
 from designer.replay import free_run, proofs
+from designer.replay.gamma import checked_gamma
 from designer.replay.log import Log, load
 from designer.replay.proofs import Central, Check
-from designer.replay.verdict import Divergence, Proof, Verdict
+from designer.replay.verdict import Divergence, Peak, Proof, Verdict
 
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
 _STEPS_AT_ONCE = 1024
@@ -53,8 +58,8 @@ def replay(path: FilePath) -> Verdict:
     central = Central.of(log.gains)
     tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
-        peak = _compare(log, central, tally)
-    return _verdict(log, tally, peak)
+        audit = _compare(log, central, tally)
+    return _verdict(log, tally, audit)
 
 
 class Tally:
@@ -100,24 +105,40 @@ class Tally:
         )
 
 
-class Peak:
-    """Peak, energy and the path inequality, gathered block by block."""
+class PathAudit:
+    """Proof 5, gathered block by block. `nw`: numbers in w; one alone makes the bound an equality at step 1."""
 
-    def __init__(self) -> None:
-        self.peak, self.margin, self.compared, self.holds = 0.0, np.inf, 0, True
+    def __init__(self, nw: int) -> None:
+        self._nw = nw
+        self.holds, self.compared = True, 0
+        self.margin, self.step = np.inf, -1  # the smallest, and where
+        self.is_equality_at_1 = False  # so that step 1 says nothing, and is not in the margin
 
     def add(self, path: free_run.Path, tolerance: float) -> None:
         known = ~np.isnan(path.error) & ~np.isnan(path.bound)
-        error, bound = path.error[known], path.bound[known]
+        within = path.error <= path.bound + tolerance * path.rounding
         self.compared += int(known.sum())
-        self.peak = max(self.peak, float(np.nanmax(path.error, initial=0.0)))
-        self.holds &= bool((error <= bound + tolerance * path.rounding[known]).all())
-        margins = 1.0 - error[bound > 0.0] / bound[bound > 0.0]
-        self.margin = min(self.margin, float(margins.min(initial=np.inf)))
+        self.holds &= bool(within[known].all())
+        steps = path.first + np.arange(len(path.error))
+        counts = known & (path.bound > 0.0)
+        trivial = counts & within & (steps == 1) & (self._nw == 1)
+        self.is_equality_at_1 |= bool(trivial.any())
+        counts &= ~trivial
+        if counts.any():
+            margins = 1.0 - path.error[counts] / path.bound[counts]
+            if margins.min() < self.margin:
+                self.margin, self.step = float(margins.min()), int(steps[counts][margins.argmin()])
+
+    def note(self) -> str:
+        smallest = f"smallest margin {self.margin:.1%}, at step {self.step}"
+        if self.is_equality_at_1:
+            why = "at step 1 the bound is an equality, because w is one number"
+            return f"{smallest}; {why}" if self.step >= 0 else why
+        return smallest if self.step >= 0 else "nothing disturbed the run"
 
 
-def _compare(log: Log, central: Central, tally: Tally) -> tuple[Peak, float] | None:
-    """All checks, a block of steps at a time; returns peak and energy where there is a plant."""
+def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float] | None:
+    """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
     drawn = proofs.draw(log)
     inputs, eta, hears = (
         proofs.logged_inputs(log),
@@ -134,15 +155,23 @@ def _compare(log: Log, central: Central, tally: Tally) -> tuple[Peak, float] | N
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
-    peak = Peak()
+    audit, errors = PathAudit(log.gains.problem.nw), log.error_norms()
     for part in free_run.free_run(log, central, whole, block=block):
         tally.add([free_run.free_check(log, central, part, eta)])
         if log.has_plant:
-            peak.add(free_run.path_block(log, central, part, energy_before), tally.tolerance)
-    return (peak, float(energies.sum())) if log.has_plant else None
+            audit.add(free_run.path_block(central, part, errors, energy_before), tally.tolerance)
+    return (audit, float(energies.sum())) if log.has_plant else None
 
 
-def _verdict(log: Log, tally: Tally, peak: tuple[Peak, float] | None) -> Verdict:
+def _peak(log: Log) -> Peak | None:
+    errors = log.error_norms()
+    if not np.isfinite(errors).any():
+        return None
+    step = int(np.nanargmax(errors))
+    return Peak(float(errors[step]), step)
+
+
+def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> Verdict:
     end = log.end or {}
     return Verdict(
         recording=str(log.path),
@@ -155,8 +184,9 @@ def _verdict(log: Log, tally: Tally, peak: tuple[Peak, float] | None) -> Verdict
         reason=end.get("reason", ""),
         damage=log.damage,
         finished=log.finished,
-        has_plant=log.has_plant,
-        proofs=tuple(_proofs(log, tally, peak)),
+        is_simulated=log.is_simulated,
+        external=tuple(name for name, real in zip(log.gains.problem.node_names, log.external, strict=True) if real),
+        proofs=tuple(_proofs(log, tally, audit[0] if audit else None)),
         worst_gap=max(tally.gaps.values()),
         worst=tally.worst,
         tolerance=tally.tolerance,
@@ -165,22 +195,32 @@ def _verdict(log: Log, tally: Tally, peak: tuple[Peak, float] | None) -> Verdict
         duplicates=log.census.duplicates,
         strange=log.census.strange,
         numbering=log.census.numbering,
-        peak=peak[0].peak if peak else None,
-        energy=peak[1] if peak else None,
-        gamma=log.gains.certificate.gamma,
-        path_margin=peak[0].margin if peak and np.isfinite(peak[0].margin) else None,
+        peak=_peak(log),
+        energy=audit[1] if audit else None,
+        gamma=checked_gamma(log.gains),
+        path_margin=audit[0].margin if audit and audit[0].step >= 0 else None,
     )
 
 
-def _proofs(log: Log, tally: Tally, peak: tuple[Peak, float] | None) -> Iterator[Proof]:
+def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
     for number, gap in tally.gaps.items():
-        yield Proof(number, gap <= tally.tolerance, tally.compared[number], gap)
-    once = not (log.census.duplicates.total or log.census.strange or log.census.numbering)
-    whole = not log.finished or log.census.missing.total == 0  # a cut file must lack something
-    note = f"{log.census.missing.total} missing, {log.census.duplicates.total} double"
-    yield Proof(4, once and whole, log.messages, 0.0, note)
-    if peak is None:
-        yield Proof(5, True, 0, 0.0, "real sensors: the error is not known")
+        compared = tally.compared[number]
+        yield Proof(number, gap <= tally.tolerance if compared else None, compared, gap)
+    yield _census_proof(log)
+    if audit is not None:
+        yield Proof(5, audit.holds if audit.compared else None, audit.compared, 0.0, audit.note())
+    elif log.is_simulated:
+        yield Proof(5, None, 0, 0.0, "it does not apply to measurements that are not of the simulated plant")
     else:
-        margin = f"smallest margin {peak[0].margin:.1%}" if np.isfinite(peak[0].margin) else "nothing disturbed the run"
-        yield Proof(5, peak[0].holds, peak[0].compared, 0.0, margin)
+        yield Proof(5, None, 0, 0.0, "without a plant the error is not known")
+
+
+def _census_proof(log: Log) -> Proof:
+    """A cut file must lack something: that is held against it no more than it shows anything."""
+    missing, duplicates = log.census.missing, log.census.duplicates
+    faulty = bool(duplicates.total or log.census.strange or log.census.numbering)
+    if log.finished or faulty:
+        note = f"{missing.total} missing, {duplicates.total} double"
+        return Proof(4, not faulty and not missing.total, log.messages, 0.0, note)
+    note = f"{missing.total} lacking from step {missing.first[0].step} on" if missing.total else "none double"
+    return Proof(4, None, log.messages, 0.0, note)

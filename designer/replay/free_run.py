@@ -23,7 +23,7 @@ class FreeBlock(NamedTuple):
 
 
 def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs:
-    """Inputs without holes: what is not logged comes from the seed's draws, or from what the node made of it."""
+    """Inputs without holes: what is not logged comes from the seed, or from what the node made of it."""
     mode = np.where((inputs.mode >= 0) & (inputs.mode < len(log.gains.problem.topologies)), inputs.mode, drawn.mode)
     if log.has_plant:
         theta = np.where(np.isnan(inputs.theta), drawn.theta, inputs.theta)
@@ -88,19 +88,23 @@ def free_check(log: Log, central: Central, block: FreeBlock, eta: Array) -> Chec
 
 
 class Path(NamedTuple):
-    """Proof 5 over one block: |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2."""
+    """Proof 5 over one block: |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2.
 
+    At step 1 it reads |M B w(0)| <= |M B| |w(0)| with the B of the first mode, so it is an equality where w is one
+    number. Later gamma_path(k) |w(0), ..., w(k-1)| is attained by one direction of that vector alone.
+    """
+
+    first: int
     error: Array  # (steps,): |z_tilde(k)|, as logged; nan where a message is missing
     bound: Array  # (steps,): gamma_path(k) sqrt(energy of the steps before)
     rounding: Array  # (steps,): a relative rounding error of t in every step moves the error by t times this
 
 
-def path_block(log: Log, central: Central, block: FreeBlock, energy_before: Array) -> Path:
-    """`energy_before` (all steps) is the sum over j < k of |w(j)|^2."""
+def path_block(central: Central, block: FreeBlock, errors: Array, energy_before: Array) -> Path:
+    """`errors` (all steps) are |z_tilde(k)|; `energy_before` (all steps) is the sum over j < k of |w(j)|^2."""
     steps = slice(block.first, block.first + len(block.eta))
-    z_tilde = np.tile(log.z[steps], central.problem.n) - log.z_hat[steps]
     rounding = np.linalg.norm(block.reach @ np.abs(central.model.M).T, axis=1)
-    return Path(np.linalg.norm(z_tilde, axis=1), block.path * np.sqrt(energy_before[steps]), rounding)
+    return Path(block.first, errors[steps], block.path * np.sqrt(energy_before[steps]), rounding)
 
 
 def _magnitudes(log: Log, central: Central, inputs: Inputs, eta: Array, first: int) -> Array:

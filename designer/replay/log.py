@@ -54,9 +54,18 @@ class Log:
     heard: Numbers  # (steps, n): Estimate.heard
 
     @property
+    def is_simulated(self) -> bool:
+        """A simulated plant was recorded."""
+        return bool(np.isfinite(self.x).any())
+
+    @property
     def has_plant(self) -> bool:
         """A simulated plant gave every measurement and was recorded, so that errors can be computed."""
-        return not any(self.external) and bool(np.isfinite(self.x).any())
+        return not any(self.external) and self.is_simulated
+
+    def error_norms(self) -> Array:
+        """|z_tilde(k)| over all nodes, as logged, (steps,); NaN where a message is missing."""
+        return np.asarray(np.linalg.norm(np.tile(self.z, self.gains.problem.n) - self.z_hat, axis=1))
 
 
 def load(path: Path) -> Log:

@@ -106,7 +106,7 @@ class Inputs(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What the run's seed draws."""
+    """What the run's seed gives."""
 
     mode: Numbers  # (steps,)
     theta: Array  # (steps, n)

@@ -7,13 +7,14 @@ from typing import Any
 
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO
 from designer.replay.census import Faults
+from designer.replay.gamma import Gamma
 
-CLAIMS = {
-    1: "plant, sensors, draws and each node's own words agree",
-    2: "one step of the central model from the log gives the log",
-    3: "the central model running freely stays with the log",
-    4: "every message is there once",
-    5: "path inequality |z~(k)|^2 <= gamma_path(k)^2 sum |w|^2",
+CLAIMS = {  # what each proof shows, and what is counted
+    1: ("plant, sensors, the seed's modes, losses and disturbance, and what each node says of itself agree", "values"),
+    2: ("one step of the centralised model from the logged state gives the next logged state", "values"),
+    3: ("the centralised model running freely from step 0 stays with the log", "values"),
+    4: ("every message is there once", "messages"),
+    5: ("path inequality |z~(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2", "steps"),
 }
 
 
@@ -29,12 +30,16 @@ class Divergence:
     logged: float | str
     proof: int
 
-    def text(self) -> str:
+    @property
+    def place(self) -> str:
         whose = f'of node "{self.node}"' if self.node is not None else "of the plant"
         if self.field == "mode" and self.node is None:
             whose = "of the coordinator"
+        return f"{self.field} {whose}"
+
+    def text(self) -> str:
         values = (repr(value) if isinstance(value, float) else f'"{value}"' for value in (self.logged, self.expected))
-        return "step {}: {} {} is {}, expected {}".format(self.step, self.field, whose, *values)
+        return "step {}: {} is {}, expected {}".format(self.step, self.place, *values)
 
 
 @dataclass(frozen=True)
@@ -42,10 +47,31 @@ class Proof:
     """The outcome of one of the five proofs."""
 
     number: int
-    holds: bool
-    compared: int  # numbers, names or messages that were compared; 0 where nothing could be
+    holds: bool | None  # None: nothing can be said, because nothing was compared, or the file is cut
+    compared: int  # numbers and names, messages, or steps; 0 where nothing could be compared
     worst_gap: float
     note: str = ""
+
+    def text(self) -> str:
+        claim, counted = CLAIMS[self.number]
+        match self.holds:
+            case None:
+                outcome = "cut  " if self.number == 4 else "  -  "
+            case _:
+                outcome = "holds" if self.holds else "FAILS"
+        details = [f"{self.compared} {counted}" + (" compared" if self.number <= 3 else "")]
+        if self.number <= 3 and self.compared:
+            details[0] += f", largest gap {self.worst_gap:.1e}"
+        details += [self.note] if self.note else []
+        return f"  {self.number} {outcome}  {claim} ({'; '.join(details)})"
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The largest |z_tilde(k)| over all nodes."""
+
+    size: float
+    step: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +88,8 @@ class Verdict:
     reason: str
     damage: str  # what is wrong with the file, "" where nothing is
     finished: bool
-    has_plant: bool  # False: real sensors, so estimates are compared, and nothing is known of the error
+    is_simulated: bool  # a simulated plant is in the file
+    external: tuple[str, ...]  # nodes with sensors of their own; where there are any, estimates are compared
     proofs: tuple[Proof, ...]
     worst_gap: float
     worst: Divergence | None  # where the worst gap is
@@ -72,15 +99,15 @@ class Verdict:
     duplicates: Faults
     strange: tuple[str, ...]  # what should not be in the file
     numbering: tuple[str, ...]  # faults in the senders' numbering
-    peak: float | None  # max over k of |z_tilde(k)|
+    peak: Peak | None  # against the simulated plant, also where sensors measured something else
     energy: float | None  # sum of |w|^2
-    gamma: float
-    path_margin: float | None  # smallest 1 - |z_tilde(k)| / (gamma_path(k) sqrt(energy before k))
+    gamma: Gamma
+    path_margin: float | None  # smallest 1 - |z_tilde(k)| / (gamma_path(k) sqrt(energy before k)) that is not trivial
 
     @property
     def agrees(self) -> bool:
         """What is in the file agrees. Messages that a cut file lacks are not held against it."""
-        return all(proof.holds for proof in self.proofs)
+        return all(proof.holds is not False for proof in self.proofs)
 
     @property
     def exit_code(self) -> int:
@@ -113,16 +140,21 @@ class Verdict:
             "duplicates_first": [place._asdict() for place in self.duplicates.first],
             "strange": list(self.strange),
             "numbering": list(self.numbering),
-            "real_sensors": not self.has_plant,
-            "peak": self.peak,
+            "simulated": self.is_simulated,
+            "real_sensors": bool(self.external),
+            "external": list(self.external),
+            "peak": self.peak.size if self.peak else None,
+            "peak_step": self.peak.step if self.peak else None,
             "energy": self.energy,
-            "gamma": self.gamma,
+            "gamma": self.gamma.value,
+            "certificate": self.gamma.failure is None,
+            "certificate_failure": self.gamma.failure,
             "path_margin": self.path_margin,
             "proofs": [vars(proof) for proof in self.proofs],
         }
 
     def text(self) -> str:
-        return "\n".join([*self._head(), *self._proofs(), *self._faults(), *self._peak()])
+        return "\n".join([*self._head(), *self._peak(), *self._proofs(), *self._faults()])
 
     def _head(self) -> list[str]:
         if not self.agrees:
@@ -139,12 +171,7 @@ class Verdict:
         return lines
 
     def _proofs(self) -> list[str]:
-        lines = []
-        for proof in self.proofs:
-            outcome = "FAILS" if not proof.holds else ("holds" if proof.compared else "  -  ")
-            worst = f", worst gap {proof.worst_gap:.1e}" if proof.number <= 3 and proof.compared else ""
-            note = f"; {proof.note}" if proof.note else ""
-            lines.append(f"  {proof.number} {outcome}  {CLAIMS[proof.number]} ({proof.compared} compared{worst}{note})")
+        lines = [proof.text() for proof in self.proofs]
         if self.first_divergence:
             lines.append(
                 f"first divergence, {self.first_divergence.text()}: "
@@ -152,8 +179,8 @@ class Verdict:
             )
         elif self.worst:
             lines.append(
-                f"worst gap {self.worst_gap:.1e} within tolerance {self.tolerance:.1e} "
-                f"(margin {1.0 - self.worst_gap / self.tolerance:.0%}); {self.worst.text()}"
+                f"largest gap {self.worst_gap:.1e}, at step {self.worst.step} in {self.worst.place}; "
+                f"tolerance {self.tolerance:.1e} ({1.0 - self.worst_gap / self.tolerance:.0%} left)"
             )
         return lines
 
@@ -169,14 +196,17 @@ class Verdict:
         return lines
 
     def _peak(self) -> list[str]:
-        if self.peak is None or self.energy is None:
-            return ["no simulated plant: estimates were compared, nothing is known of the error"]
-        bound = self.gamma * self.energy**0.5
-        margin = (
-            "" if self.path_margin is None else f"; smallest margin to this path's own bound {self.path_margin:.1%}"
-        )
-        return [
-            f"peak |z~| {self.peak:.4g}, gamma sqrt(energy) {bound:.4g} with gamma {self.gamma:.5g}{margin}",
-            "gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2: in the mean over modes and losses, from zero "
-            "initial error; one run may exceed it",
-        ]
+        lines = []
+        if self.external:
+            names = ", ".join(f'"{name}"' for name in self.external)
+            lines.append(f"sensors of their own: {names}; estimates are compared instead of errors")
+        if not self.is_simulated:
+            lines.append("no simulated plant: nothing is known of the error")
+        if self.peak is not None:
+            bound = "" if self.energy is None or not self.gamma.is_claimed else self._bound(self.energy)
+            against = " against the simulated plant" if self.external else ""
+            lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}")
+        return [*lines, self.gamma.text()]
+
+    def _bound(self, energy: float) -> str:
+        return f", gamma sqrt(energy) {self.gamma.value * energy**0.5:.4g} with gamma {self.gamma.value:.5g}"

@@ -1,0 +1,43 @@
+"""The gamma of the gains in a recording: a number in a file, until their certificate is checked again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.contract.errors import InputError
+from agent.contract.gains import Gains
+from designer import certificate
+
+
+@dataclass(frozen=True)
+class Gamma:
+    """A gamma, and whether the certificate beside it proves it."""
+
+    value: float
+    is_claimed: bool
+    failure: str | None  # why it is not proved
+
+    def text(self) -> str:
+        if not self.is_claimed:
+            return "certificate  none: gamma is not claimed"
+        if self.failure is not None:
+            return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
+        return (
+            "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes and "
+            "losses, from zero initial error; one run may exceed it"
+        )
+
+
+def checked_gamma(gains: Gains) -> Gamma:
+    """What the gains claim, checked again from their own numbers."""
+    claim = gains.certificate
+    if not claim.holds:
+        return Gamma(claim.gamma, is_claimed=False, failure="gamma is not claimed")
+    try:
+        with np.errstate(all="ignore"):  # numbers that overflow prove nothing
+            failure = certificate.verify(gains).failure
+    except (InputError, np.linalg.LinAlgError) as error:
+        failure = str(error)
+    return Gamma(claim.gamma, is_claimed=True, failure=failure)
