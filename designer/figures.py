@@ -81,7 +81,7 @@ def outputs_figure(log: Log) -> Figure:
         figure, panels, strip = _canvas(log, strip_height=0.35 + 0.1 * len(problem.topologies))
         for row, axes in enumerate(panels):
             if log.has_plant:
-                _line(axes, log.z[:, row], colour=BLACK, width=2.6, label="$z$", over=1)
+                _line(axes, log.z[:, row], colour=BLACK, width=2.2, label="$z$", over=1)
             for i, style in enumerate(_styles(problem.n, _shown_steps(log))):
                 _line(axes, log.z_hat[:, i * problem.nz + row], label=label(problem.node_names[i]), **style)
             axes.set_ylabel(_indexed(r"$z$ and $\hat{z}_i$" if log.has_plant else r"$\hat{z}_i$", row, problem.nz))
@@ -122,9 +122,8 @@ def _canvas(log: Log, *, strip_height: float) -> tuple[Figure, list[Any], Any]:
     strip.set_xlabel("step $k$")
     if shown < log.steps:
         curves = r"$|z|$ and every $|\hat{z}_i|$" if log.has_plant else r"every $|\hat{z}_i|$"
-        note = f"steps {shown} to {log.steps - 1}, where {curves} stay below {100 * SETTLED:g} % of the largest,"
-        note += "\nare not shown"
-        panels[0].text(1, 1, note, transform=panels[0].transAxes, ha="right", va="top", color=GREY, fontsize=6.5)
+        rest = f"steps {shown} to {log.steps - 1}, where {curves} stay below {100 * SETTLED:g} % of the largest"
+        panels[0].set_title(f"{rest}, are not shown", loc="right", color=GREY, fontsize=6.5)
     figure.supxlabel(_caption(log), x=0.99, ha="right", color=GREY, fontsize=6.5)
     figure.align_ylabels()
     return figure, panels, strip
@@ -132,7 +131,8 @@ def _canvas(log: Log, *, strip_height: float) -> tuple[Figure, list[Any], Any]:
 
 def _caption(log: Log) -> str:
     gamma = checked_gamma(log.gains)
-    proved = f"γ = {gamma.value:.6g}" if gamma.failure is None else "γ is not proved"
+    unproved = "γ is not proved" if gamma.is_claimed else "γ is not claimed"
+    proved = f"γ = {gamma.value:.6g}" if gamma.failure is None else unproved
     return f"{log.gains.problem.name}, seed {log.seed}, {proved}"
 
 
@@ -215,10 +215,11 @@ def _styles(n: int, steps: int) -> Iterator[dict[str, Any]]:
     raster = {"rasterized": True} if n > RASTER_ABOVE else {}
     if n <= len(MARKERS):
         every = -(-steps // MARKED)
+        broadest = 1.8 if every == 1 else 1.2
         for i, marker in enumerate(MARKERS[:n]):
             marked = {"marker": marker, "markersize": 4.2, "markerfacecolor": "none", "markeredgewidth": 0.8}
             marked["marks"] = range(i * every // n, steps, every)
-            dashes, width = DASHES[i // len(COLOURS)], 1.8 - i * 1.1 / max(1, n - 1)
+            dashes, width = DASHES[i // len(COLOURS)], broadest - i * (broadest - 0.6) / max(1, n - 1)
             yield {"colour": COLOURS[i % len(COLOURS)], "dashes": dashes, "width": width, **marked}
     elif n <= len(COLOURS) * len(DASHES):
         for i in range(n):

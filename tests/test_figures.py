@@ -65,7 +65,7 @@ def test_the_caption_says_what_is_shown_and_a_note_what_is_not() -> None:
         assert figure.get_supxlabel() == "zhu2020-lossy, seed 2020, γ = 0.347992"
         panel, strip = figure.axes
         last = round(strip.get_xlim()[1])
-        assert panel.texts[0].get_text().startswith(f"steps {last + 1} to {log.steps - 1}, where")
+        assert panel.get_title("right").startswith(f"steps {last + 1} to {log.steps - 1}, where")
         hidden = np.abs(np.hstack([log.z, log.z_hat])[last + 1 :]).max()
         assert hidden <= 0.01 * np.abs(np.hstack([log.z, log.z_hat])).max()
 
