@@ -13,19 +13,24 @@ from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.back_off import Confirmed, back_off
+from designer.descent import Progress
 from designer.error_model import link_gains, stacked_links
+from designer.exact_design import design_exact, with_ladder
 from designer.lmi import LmiSolution
 
 
-def design(problem: Problem, *, method: str = "theorem2") -> Gains:
+def design(problem: Problem, *, method: str = "theorem2", progress: Callable[[Progress], None] | None = None) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
+    `progress` is called during the method "exact" only, which also returns its best gains on KeyboardInterrupt.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found.
     """
-    if method not in METHODS:
-        raise InputError(f'method "{method}" does not exist; the methods are {listed(METHODS)}')
+    if method not in METHODS and method != EXACT:
+        raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
     if not problem.plant.M.any():
         raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
+    if method == EXACT:
+        return design_exact(problem, progress=progress)
     started = time.perf_counter()
     solution = METHODS[method](problem)
     solved = time.perf_counter()
@@ -40,7 +45,7 @@ def design(problem: Problem, *, method: str = "theorem2") -> Gains:
         method=method,
         K=K,
         H=H,
-        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
+        certificate=with_ladder(problem, K, H, _certificate(problem, confirmed, lmi_gamma=solution.gamma)),
         solver=solution.solver,
         seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
     )
@@ -128,6 +133,7 @@ def _theorem2_reduced(problem: Problem) -> LmiSolution:
     return theorem2.solve(problem, reduced=True)
 
 
+EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 METHODS: dict[str, Callable[[Problem], LmiSolution]] = {
     "theorem2": _theorem2,  # (36)(37) as printed
     "theorem2-reduced": _theorem2_reduced,  # the same for the state [x; e]: faster, gamma equal or slightly lower
