@@ -16,7 +16,7 @@ from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 
 _SETTLED = 1e-12
-_MOST_STEPS = 100_000
+_MOST_STEPS = 10_000
 _DEPENDENT = 1e-10  # a combination of scaled measurements smaller than this is no measurement
 
 
@@ -33,7 +33,9 @@ def floor(problem: Problem) -> float:
     S, reached = np.zeros((problem.nx, problem.nx)), 0.0
     for _ in range(_MOST_STEPS):
         kernel = _kernel(np.hstack([C @ S, D]))
-        left, sizes, _ = np.linalg.svd(np.hstack([plant.A @ S, plant.B]) @ kernel, full_matrices=False)
+        step = np.hstack([plant.A @ S, plant.B])
+        left, sizes, _ = np.linalg.svd(step @ kernel, full_matrices=False)
+        sizes[sizes <= _DEPENDENT * np.linalg.norm(step)] = 0.0  # rounding of the kernel moves no state
         S_next = np.zeros_like(S)
         S_next[:, : len(sizes)] = left * sizes
         change = np.abs(S_next @ S_next.T - S @ S.T).max()

@@ -15,7 +15,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.error_model import error_model, stacks
-from designer.gain import Operator, horizon_gain
+from designer.gain import Operator, horizon_gain, horizon_holds
 
 
 class Sweep(NamedTuple):
@@ -114,9 +114,7 @@ def gain_slope(problem: Problem, K_bar: Array, H_bar: Array, *, horizon: int) ->
     the gains, and the energy of the w that follow, with that of u, is its derivative by g.
     """
     operator = Operator(error_model(problem, K_bar, H_bar))
-    _, g = horizon_gain(operator, horizon, width=1e-10)
-    swept = sweep(operator, g, horizon)
-    assert swept is not None  # the recursion held at g
+    g, swept = critical_sweep(operator, horizon)
     k, s, u = critical(swept)
     V = np.zeros_like(swept.W_inverse)
     V[k, s] = np.outer(u, u)
@@ -124,6 +122,23 @@ def gain_slope(problem: Problem, K_bar: Array, H_bar: Array, *, horizon: int) ->
     gamma = math.sqrt(g)
     scale = 1.0 / ((1.0 - slopes.g) * 2.0 * gamma)
     return GainSlope(gamma, scale * slopes.K_bar, scale * slopes.H_bar)
+
+
+def critical_sweep(operator: Operator, horizon: int) -> tuple[float, Sweep]:
+    """gamma_T^2 and the sweep there, over the first horizon that comes within 1e-8 of it.
+
+    Later steps raise gamma_T by less than can be told: their W turns singular within rounding of the same g.
+    """
+    low, _ = horizon_gain(operator, horizon)
+    first, last = 0, horizon
+    while last - first > 1:
+        middle = (first + last) // 2
+        holds, _ = horizon_holds(operator, low * (1.0 - 1e-8), middle)
+        first, last = (middle, last) if holds else (first, middle)
+    _, g = horizon_gain(operator, last, width=1e-13)
+    swept = sweep(operator, g, last)
+    assert swept is not None  # the recursion held at g
+    return g, swept
 
 
 def critical(swept: Sweep) -> tuple[int, int, Array]:

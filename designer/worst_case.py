@@ -10,8 +10,8 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.error_model import ErrorModel
-from designer.gain import Operator, horizon_gain
-from designer.sensitivity import critical, sweep
+from designer.gain import Operator
+from designer.sensitivity import critical, critical_sweep
 
 
 class Policy(NamedTuple):
@@ -27,11 +27,9 @@ class Policy(NamedTuple):
 
 
 def worst_policy(model: ErrorModel, *, horizon: int) -> Policy:
-    """The policy that attains gamma_T, T = horizon; Gamma = W^-1 B'Y_bar A at g = gamma_T^2."""
+    """The policy that attains gamma_T, T = horizon, to 1e-8; Gamma = W^-1 B'Y_bar A at g = gamma_T^2."""
     operator = Operator(model)
-    _, g = horizon_gain(operator, horizon, width=1e-10)
-    swept = sweep(operator, g, horizon)
-    assert swept is not None  # the recursion held at g
+    g, swept = critical_sweep(operator, horizon)
     k, s, u = critical(swept)
     return Policy(math.sqrt(g), s, u, swept.Gamma[:k][::-1])
 
