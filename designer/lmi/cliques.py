@@ -24,8 +24,7 @@ def clique_tree(groups: Iterable[Iterable[int]]) -> list[Clique]:
     """The maximal cliques of a chordal graph in which every group, and vertex 0 with all, is connected.
 
     Vertices are eliminated, the one with the fewest neighbours left first and vertex 0 last; the neighbours of
-    an eliminated vertex become neighbours of each other, which makes the graph chordal. A clique comes before the
-    one above it.
+    an eliminated vertex become neighbours of each other, which makes the graph chordal.
     """
     left = _neighbours(groups)
     cliques: list[Clique] = []

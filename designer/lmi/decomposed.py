@@ -8,8 +8,8 @@ For each mode s, with Q_bar_i = sum_t pi_st Q_i(t), N the nodes that node i hear
     balance  diag{R, I, Q(s)} - [A B]'R[A B] - sum_i S_i - sum_ij alpha_j C_j'T_ij C_j >= 0, over (x, w, e)
     peak i   [Q_i(s), M'; M, delta I] >= 0
 
-The balance is large and sparse: it is split along a tree of cliques into pieces that exchange what they share. In
-each piece one node needs no S_i: what is left of the piece serves. docs/decomposed.md derives all of this.
+and R >= 0 once. The balance is large and sparse: it is split along a tree of cliques into pieces that exchange what
+they share. In each piece one node needs no S_i: what is left of the piece serves. docs/decomposed.md derives it all.
 """
 
 from __future__ import annotations
@@ -113,6 +113,9 @@ def assemble(problem: Problem) -> Lmi:
     """Unknowns and inequalities of every mode."""
     build, nx, n = Assembly(), problem.nx, problem.n
     delta, R = build.unknown(1, 1), build.symmetric(nx)
+    positive = build.inequality()  # R >= 0: the balance implies it for stable plants only
+    x = positive.append(nx)
+    positive.add(x, x, R)
     Q = [[build.symmetric(nx) for _ in range(n)] for _ in problem.topologies]
     modes = []
     for s, weights in enumerate(problem.markov.transition):
@@ -139,7 +142,7 @@ def assemble(problem: Problem) -> Lmi:
 def _balance(
     build: Assembly, problem: Problem, R: Indices, Q: list[Indices], heard: list[tuple[int, ...]]
 ) -> list[Piece]:
-    """diag{R, I, Q(s)} - [A B]'R[A B] in pieces: one for each clique, the last of them the top of the tree."""
+    """diag{R, I, Q(s)} - [A B]'R[A B] in pieces, one for each clique; all of them have (x, w)."""
     nx, nw = problem.nx, problem.nw
     tree = clique_tree([j + 1 for j in heard_i] for heard_i in heard)
     pieces = []
@@ -155,11 +158,11 @@ def _balance(
             U, above = build.symmetric(len(piece.rows(clique.shared))), pieces[clique.above]
             piece.matrix.add(piece.rows(clique.shared), piece.rows(clique.shared), U, factor=-1.0)
             above.matrix.add(above.rows(clique.shared), above.rows(clique.shared), U)
-    top, A_B = pieces[-1], np.hstack([problem.plant.A, problem.plant.B])
-    x, w = np.split(top.at[0], [nx])
-    top.matrix.add(x, x, R)
-    top.matrix.add_number(w, w, np.eye(nw))
-    top.matrix.add(top.at[0], top.at[0], R, factor=-1.0, left=A_B.T, right=A_B)
+    first, A_B = pieces[0], np.hstack([problem.plant.A, problem.plant.B])
+    x, w = np.split(first.at[0], [nx])
+    first.matrix.add(x, x, R)
+    first.matrix.add_number(w, w, np.eye(nw))
+    first.matrix.add(first.at[0], first.at[0], R, factor=-1.0, left=A_B.T, right=A_B)
     return pieces
 
 

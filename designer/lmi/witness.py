@@ -47,7 +47,7 @@ def witness(problem: Problem) -> Witness:
     constraints = [
         matrix >> 0 for mode in modes for matrix in (*mode.nodes, *mode.links.values(), mode.balance, *mode.peaks)
     ]
-    return Witness(delta, R, modes, cp.Problem(cp.Minimize(delta), constraints))
+    return Witness(delta, R, modes, cp.Problem(cp.Minimize(delta), [R >> 0, *constraints]))
 
 
 def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> WitnessMode:

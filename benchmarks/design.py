@@ -1,0 +1,108 @@
+"""How long a design takes: the paper's LMI as printed beside the decomposed one, and large networks.
+
+    python benchmarks/design.py [--literal 4 8 12] [--decomposed 4 8 12 25 50 100 200] [--seed 1]
+
+Every design runs in a process of its own, so that its peak memory is its own. "solver" is the solver's own part,
+"whole" everything from problem to certified gains. The networks are `banded`, with 4 modes and 2 states.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+
+from agent.contract.problem import Problem
+from designer.problems import find
+
+REACH = 2
+CHILD = """
+import json, resource, sys, time
+from benchmarks.design import banded
+from designer.synthesis import design
+problem = banded(int(sys.argv[2]), seed=int(sys.argv[3]))
+started = time.perf_counter()
+gains = design(problem, method=sys.argv[1])
+whole = time.perf_counter() - started
+proved = gains.certificate
+print(json.dumps({
+    "solver": gains.solver.seconds, "whole": whole, "certify": gains.seconds["certify"],
+    "lmi_gamma": proved.lmi_gamma, "gamma": proved.gamma, "form": proved.form, "status": gains.solver.status,
+    "iterations": gains.solver.iterations, "file": len(gains.canonical()) / 1e6,
+    "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+}))
+"""
+
+
+def banded(n: int, *, seed: int = 1) -> Problem:
+    """The paper's plant and chain, n random nodes in a row.
+
+    A node can hear the two before it and the two after it; in each mode each of these links is there with
+    probability one half.
+    """
+    rng = np.random.default_rng([seed, n])
+    paper = find("zhu2020-lossy").document()
+    names = [str(i + 1) for i in range(n)]
+    nodes = [
+        {
+            "name": name,
+            "C": [rng.uniform(0.1, 0.7, size=2).tolist()],
+            "D": [[float(rng.uniform(0.4, 1.0))]],
+            "arrival_probability": float(rng.uniform(0.75, 0.95)),
+        }
+        for name in names
+    ]
+    near = [[j for j in range(max(0, i - REACH), min(n, i + REACH + 1)) if j != i] for i in range(n)]
+    topologies = []
+    for mode in paper["topology"]:
+        hears = {name: [names[j] for j in near[i] if rng.uniform() < 0.5] for i, name in enumerate(names)}
+        topologies.append({"name": mode["name"], "hears": hears})
+    return Problem.from_document({**paper, "name": f"banded-{n}", "node": nodes, "topology": topologies})
+
+
+def measure(method: str, n: int, seed: int) -> dict[str, Any]:
+    """One design in a process of its own."""
+    child = [sys.executable, "-c", CHILD, method, str(n), str(seed)]
+    done = subprocess.run(child, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{method}, {n} nodes: {done.stderr.strip().splitlines()[-1]}")
+    return dict(json.loads(done.stdout))
+
+
+def main() -> None:
+    """Measure and print, line by line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--literal", type=int, nargs="*", default=[4, 8, 12], metavar="NODES")
+    parser.add_argument("--decomposed", type=int, nargs="*", default=[4, 8, 12, 25, 50, 100, 200], metavar="NODES")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    print(
+        "method      nodes  solver s  whole s  certify s  peak MB  file MB   LMI gamma   certified  form        solver"
+    )
+    measured: dict[tuple[str, int], dict[str, Any]] = {}
+    plan = [("decomposed", n) for n in options.decomposed] + [("theorem2", n) for n in options.literal]
+    for method, n in plan:
+        facts = measured[method, n] = measure(method, n, options.seed)
+        print(
+            f"{method:<11} {n:5d} {facts['solver']:9.2f} {facts['whole']:8.2f} {facts['certify']:10.2f} "
+            f"{facts['peak']:8.0f} {facts['file']:8.3f} {facts['lmi_gamma']:11.6f} {facts['gamma']:11.6f}  "
+            f"{facts['form']:<11} {facts['status']}, {facts['iterations']} iterations",
+            flush=True,
+        )
+    for n in options.literal:
+        if ("decomposed", n) in measured:
+            literal, ours = measured["theorem2", n], measured["decomposed", n]
+            print(f"{n} nodes: decomposed is {literal['whole'] / ours['whole']:.0f} times faster as a whole")
+    large = [n for n in options.decomposed if n >= 25]
+    if len(large) > 1:
+        seconds = [measured["decomposed", n]["whole"] for n in large]
+        fitted = np.polyfit(np.log(large), np.log(seconds), 1)[0]
+        print(f"from {large[0]} to {large[-1]} nodes the whole design grows as nodes^{fitted:.2f} (least squares)")
+
+
+if __name__ == "__main__":
+    main()
