@@ -74,38 +74,46 @@ def measure(method: str, n: int, seed: int) -> dict[str, Any]:
     return dict(json.loads(done.stdout))
 
 
+def row(method: str, n: int, facts: dict[str, Any]) -> str:
+    """One line of the table."""
+    numbers = [f"{facts[name]:9.2f}" for name in ("solver", "whole", "cpu", "certify")]
+    sizes = f"{facts['peak']:8.0f} {facts['file']:8.3f} {facts['lmi_gamma']:10.6f} {facts['gamma']:10.6f}"
+    said = f"{facts['form']}; {facts['status']}, {facts['iterations']} iterations"
+    return f"{method:<10} {n:5d} {''.join(numbers)} {sizes}  {said}"
+
+
+HEAD = "method     nodes  solver s  whole s    cpu s certify s  peak MB  file MB  LMI gamma  certified  P; solver"
+
+
+def summary(measured: dict[tuple[str, int], dict[str, Any]]) -> list[str]:
+    """Ratios where both methods were measured, and how the time of large networks grows."""
+    lines = []
+    for n in [n for method, n in measured if method == "theorem2" and ("decomposed", n) in measured]:
+        literal, ours = measured["theorem2", n], measured["decomposed", n]
+        whole, cpu = literal["whole"] / ours["whole"], literal["cpu"] / ours["cpu"]
+        lines.append(f"{n} nodes: theorem2 takes {whole:.1f} times as long, {cpu:.1f} times the processor time")
+    large = [n for method, n in measured if method == "decomposed" and n >= 25]
+    for name, what in (("whole", "time"), ("cpu", "processor time")):
+        if len(large) > 1:
+            power = np.polyfit(np.log(large), np.log([measured["decomposed", n][name] for n in large]), 1)[0]
+            lines.append(f"{large[0]} to {large[-1]} nodes: the {what} grows as nodes^{power:.2f} (least squares)")
+    return lines
+
+
 def main() -> None:
     """Measure and print, line by line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = argparse.ArgumentParser(description="How long a design takes.")
     parser.add_argument("--literal", type=int, nargs="*", default=[4, 8, 12], metavar="NODES")
     parser.add_argument("--decomposed", type=int, nargs="*", default=[4, 8, 12, 25, 50, 100, 200], metavar="NODES")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    print(
-        "method      nodes  solver s  whole s    cpu s  certify s  peak MB  file MB   LMI gamma   certified  form        solver"
-    )
+    print(HEAD)
     measured: dict[tuple[str, int], dict[str, Any]] = {}
     plan = [("decomposed", n) for n in options.decomposed] + [("theorem2", n) for n in options.literal]
     for method, n in plan:
-        facts = measured[method, n] = measure(method, n, options.seed)
-        print(
-            f"{method:<11} {n:5d} {facts['solver']:9.2f} {facts['whole']:8.2f} {facts['cpu']:8.2f} {facts['certify']:10.2f} "
-            f"{facts['peak']:8.0f} {facts['file']:8.3f} {facts['lmi_gamma']:11.6f} {facts['gamma']:11.6f}  "
-            f"{facts['form']:<11} {facts['status']}, {facts['iterations']} iterations",
-            flush=True,
-        )
-    for n in options.literal:
-        if ("decomposed", n) in measured:
-            literal, ours = measured["theorem2", n], measured["decomposed", n]
-            whole, cpu = literal["whole"] / ours["whole"], literal["cpu"] / ours["cpu"]
-            print(
-                f"{n} nodes: decomposed takes 1/{whole:.0f} of the time of theorem2, 1/{cpu:.0f} of its processor time"
-            )
-    large = [n for n in options.decomposed if n >= 25]
-    for name, what in (("whole", "time"), ("cpu", "processor time")):
-        if len(large) > 1:
-            fitted = np.polyfit(np.log(large), np.log([measured["decomposed", n][name] for n in large]), 1)[0]
-            print(f"from {large[0]} to {large[-1]} nodes the {what} grows as nodes^{fitted:.2f} (least squares)")
+        measured[method, n] = measure(method, n, options.seed)
+        print(row(method, n, measured[method, n]), flush=True)
+    print("\n".join(summary(measured)))
 
 
 if __name__ == "__main__":
