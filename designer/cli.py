@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from agent.contract.files import refuse_overwrite
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
+    from designer.descent import Progress
 
 PROBLEM = "problem file, or the name of a built-in problem (peakmesh show lists them)"
 
@@ -78,7 +79,12 @@ def _add_design(commands: agent.cli.Subcommands) -> None:
     design = agent.cli.add_command(commands, "design", design_command, "gains with a certificate, for a problem")
     design.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
     design.add_argument("-o", "--output", type=Path, metavar="FILE", help="gains file (<problem>.gains.json)")
-    design.add_argument("--method", default="theorem2", metavar="NAME", help="theorem2: the LMI of Zhu et al. 2020")
+    design.add_argument(
+        "--method",
+        default="theorem2",
+        metavar="NAME",
+        help="theorem2: the LMI of Zhu et al. 2020; exact: the least exact gain",
+    )
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     design.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -99,7 +105,7 @@ def _design(text: str, method: str, output: Path | None, *, force: bool) -> tupl
     refuse_overwrite(path, force=force)
     from designer.synthesis import design
 
-    gains = design(problem, method=method)
+    gains = design(problem, method=method, progress=_descent_progress())
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {
@@ -117,14 +123,34 @@ def _design(text: str, method: str, output: Path | None, *, force: bool) -> tupl
 
 
 def _design_text(result: dict[str, Any]) -> str:
-    solver = result["solver"]
+    solver, exact = result["solver"], result["exact"]
+    lmi = "" if result["lmi_gamma"] is None else f" (optimum of the LMI {result['lmi_gamma']:.6f})"
+    ladder = [f"floor {result['floor']:.6f}"] if result["floor"] is not None else []
+    ladder += [f"exact gain {exact[0]:.7f} to {exact[1]:.7f}"] if exact is not None else []
     return (
-        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified "
-        f"(optimum of the LMI {result['lmi_gamma']:.6f})\n"
+        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified{lmi}\n"
+        f"ladder     {' <= '.join([*ladder, 'gamma'])}\n"
         f"{solver['name']} {solver['version']}: {solver['status']}, {solver['iterations']} iterations; "
         f"{result['seconds']['total']:.1f} s in all\n"
         f"gains      {result['output']}"
     )
+
+
+def _descent_progress() -> Callable[[Progress], None]:
+    """Prints where the descent is, every other second."""
+    shown = 0.0
+
+    def show(progress: Progress) -> None:
+        nonlocal shown
+        if progress.seconds >= shown + 2.0:
+            shown = progress.seconds
+            print(
+                f"{progress.seconds:5.0f} s  from {progress.start}: gamma < {progress.gamma:.6f} "
+                f"after {progress.steps} steps; Ctrl-C keeps the best so far",
+                file=sys.stderr,
+            )
+
+    return show
 
 
 # verify

@@ -18,9 +18,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.errors import InputError
+from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.certificate import ARITHMETIC, Verdict, _allowance, _magnitudes
-from designer.error_model import error_model
+from designer.certificate import ARITHMETIC, Verdict, _allowance, _magnitudes, lyapunov_matrix
+from designer.error_model import error_model, stacked_gains
 from designer.gain import Operator
 
 _U = 2.0**-53
@@ -73,6 +75,16 @@ class _Step:
         return [_positive(S[s], magnitude[s], self.problem) for s in range(len(S))]
 
 
+def verify_exact(gains: Gains) -> Verdict:
+    """Check everything as it stands in the gains file."""
+    proved = gains.certificate
+    if proved.horizon is None or proved.horizon < 1:
+        raise InputError(f'certificate: horizon is {proved.horizon}; kind "exact" needs the number of its steps')
+    K_bar, H_bar = stacked_gains(gains)
+    P = lyapunov_matrix(gains)
+    return check_exact(gains.problem, K_bar, H_bar, P=P, gamma=proved.gamma, horizon=proved.horizon)
+
+
 def check_exact(problem: Problem, K_bar: Array, H_bar: Array, *, P: Array, gamma: float, horizon: int) -> Verdict:
     """Whether gamma is proved by P (modes, n_eta, n_eta) and T = horizon."""
     step = _Step(problem, K_bar, H_bar)
@@ -92,6 +104,10 @@ def _parts(step: _Step, P: Array, gamma: float, horizon: int) -> Iterator[tuple[
     modes = step.problem.mode_names
     for mode, (held, margin) in zip(modes, step.margins(P, P), strict=True):
         yield f"(17) mode {mode}", held, margin
+    least = float(np.linalg.eigvalsh(P).min())
+    if not least > 0.0:
+        yield "P > 0", False, least
+        return
     MM = step.operator.MM
     MM = _raised(MM, np.abs(MM), _allowance(np.abs(MM), step.problem))
     Z = MM

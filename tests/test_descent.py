@@ -12,10 +12,10 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from designer import bfgs
 from designer.barrier import Barrier, Entries
+from designer.certificate import verify
 from designer.consensus import consensus_gains
 from designer.descent import Progress, descend
-from designer.error_model import error_model, stacked_gains
-from designer.exact_certificate import check_exact
+from designer.error_model import error_model
 from designer.floor import floor
 from designer.gain import exact_gain
 from designer.problems import find
@@ -133,8 +133,11 @@ def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
     assert proved.P is not None
     assert proved.horizon is not None
     assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
-    P = np.array([proved.P[mode] for mode in problem.mode_names])
-    assert check_exact(problem, *stacked_gains(gains), P=P, gamma=proved.gamma, horizon=proved.horizon).holds
+    assert verify(gains).holds
+    lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
+    verdict = verify(gains.model_copy(update={"certificate": lower}))
+    assert not verdict.holds
+    assert verdict.failure is not None
 
 
 def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
