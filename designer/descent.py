@@ -104,21 +104,20 @@ class _Search:
         self.begun, self.steps = time.perf_counter(), 0
         self.found: dict[str, float] = {}
         self.best: Array | None = None  # [v; y] with the least y so far
+        self.ends: list[Array] = []  # v of what each start led to
         self.centred: Array | None = None  # v of the gains that are small and decay fast
 
     def in_hand(self) -> list[StackedGains]:
-        """The best gains so far, and last the centred ones."""
-        return [
-            self.barrier.entries.unpack(v)
-            for v in (None if self.best is None else self.best[:-1], self.centred)
-            if v is not None
-        ]
+        """What each start led to, the best gains so far, and the centred ones."""
+        best = None if self.best is None else self.best[:-1]
+        return [self.barrier.entries.unpack(v) for v in (*self.ends, best, self.centred) if v is not None]
 
     def run(self, starts: Mapping[str, StackedGains]) -> None:
         """Every start by the coarse weights, the best by the fine ones, on longer horizons while T is too short."""
         coarse: dict[str, bfgs.Point] = {}
         for name, gains in starts.items():
             coarse[name] = self._follow(name, _COARSE, self._begin(gains))
+            self.ends.append(coarse[name].x[:-1])
             self.found[name] = math.exp(coarse[name].x[-1] / 2.0)
         name = min(self.found, key=lambda start: self.found[start])
         point = self._follow(name, _FINE, coarse[name].x, coarse[name].inverse_hessian)
