@@ -207,6 +207,23 @@ def test_what_failed_before_an_answer_stands_in_the_status(
     assert solution.gamma == pytest.approx(gamma, rel=1e-3)
 
 
+def test_a_solver_that_stalls_is_tried_again_on_rescaled_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An inaccurate answer is kept only where the rescaled data give none; either way both are said."""
+    problem, solved, calls = random_problem(11), conic.clarabel, 0
+
+    def clarabel(cones: Any, q: Array) -> conic.Answer:
+        nonlocal calls
+        calls += 1
+        u, record = solved(cones, q)
+        status = "optimal_inaccurate" if calls in (1, 3) else "optimal" if calls == 2 else "failed: NumericalError"
+        return conic.Answer(u, record.model_copy(update={"status": status}))
+
+    monkeypatch.setattr(conic, "clarabel", clarabel)
+    assert decomposed.solve(problem).solver.status == "optimal on rescaled data; CLARABEL optimal_inaccurate"
+    status = decomposed.solve(problem).solver.status
+    assert status == "optimal_inaccurate; CLARABEL on rescaled data failed: NumericalError"
+
+
 def test_no_answer_at_all_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     """Unattainable lists every attempt."""
     monkeypatch.setattr(conic, "clarabel", broken(2, conic.clarabel))

@@ -78,7 +78,8 @@ class Lmi(NamedTuple):
 def solve(problem: Problem) -> LmiSolution:
     """Minimise gamma^2 = delta. Clarabel first; then Clarabel on rescaled data, then SCS where it is installed.
 
-    What failed on the way stands in `solver.status`. Raises Unattainable: infeasible, or no solver had an answer.
+    What failed on the way, or stalled with an inaccurate answer, stands in `solver.status`. Raises Unattainable:
+    infeasible, or no solver had an answer.
     """
     attempts: list[tuple[Callable[[Cones, Array], conic.Answer], str]] = [
         (conic.clarabel, ""),
@@ -86,15 +87,16 @@ def solve(problem: Problem) -> LmiSolution:
         (conic.scs, " on rescaled data"),
     ]
     failures: list[str] = []
+    inaccurate: LmiSolution | None = None  # the answer of a solver that stalled, for want of a better one
     for solver, remark in attempts:
-        if not conic.installed(solver):
+        if not conic.installed(solver) or (inaccurate is not None and solver is conic.scs):
             continue
         units = natural_units(problem) if remark else Units(np.ones(problem.nx), 1.0)
         lmi = assemble(rescaled(problem, units))
         q = np.zeros(lmi.cones.A.shape[1])
         q[lmi.delta] = 1.0
         u, record = solver(lmi.cones, q)
-        if record.status in conic.INFEASIBLE:
+        if record.status in conic.INFEASIBLE and inaccurate is None:
             raise Unattainable(
                 f"the decomposed LMI of Theorem 2 is infeasible for {problem.name}, says {record.name}{remark}; it "
                 "has a solution for every plant with all eigenvalues of A well inside the unit circle: "
@@ -102,8 +104,14 @@ def solve(problem: Problem) -> LmiSolution:
             )
         if record.status in conic.SOLVED:
             status = "; ".join([record.status + remark, *failures])
-            return _solution(problem, lmi, u, units, record.model_copy(update={"status": status}))
+            solution = _solution(problem, lmi, u, units, record.model_copy(update={"status": status}))
+            if record.status == "optimal" or remark:
+                return solution
+            inaccurate = solution
         failures.append(f"{record.name}{remark} {record.status}")
+    if inaccurate is not None:
+        status = "; ".join([inaccurate.solver.status, *failures[1:]])
+        return inaccurate._replace(solver=inaccurate.solver.model_copy(update={"status": status}))
     raise Unattainable(
         f"no solver answered the decomposed LMI of Theorem 2 for {problem.name} ({'; '.join(failures)}); {_ADVICE}"
     )
