@@ -105,9 +105,9 @@ def solve(problem: Problem) -> LmiSolution:
         if record.status in conic.SOLVED:
             status = "; ".join([record.status + remark, *failures])
             solution = _solution(problem, lmi, u, units, record.model_copy(update={"status": status}))
-            if record.status == "optimal" or remark:
+            if record.status == "optimal" or (remark and inaccurate is None):
                 return solution
-            inaccurate = solution
+            inaccurate = inaccurate or solution
         failures.append(f"{record.name}{remark} {record.status}")
     if inaccurate is not None:
         status = "; ".join([inaccurate.solver.status, *failures[1:]])
