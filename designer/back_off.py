@@ -69,7 +69,7 @@ def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
         term = corner(model, term)
         if np.abs(term).max() > _GROWN * np.abs(W).max():
             return None
-        if _positive(W / 2.0 - term):
+        if positive(W / 2.0 - term):
             return P0
         P0 = P0 + term
     return None
@@ -82,7 +82,7 @@ def plant_lyapunov(model: ErrorModel, P: Array) -> Array | None:
     term, R0 = R, R.copy()
     for _ in range(_MOST_STEPS):
         term = A.T @ term @ A
-        if _positive(R / 2.0 - term):
+        if positive(R / 2.0 - term):
             P0 = np.zeros_like(P)
             P0[:, :p, :p] = R0
             return P0
@@ -116,14 +116,15 @@ def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:
 
 def _lifted(P: Array) -> Array:
     """P itself where it is positive definite, else P + shift I: a solver may leave R a rounding below 0."""
-    if all(_positive(P_s) for P_s in P):
+    if all(positive(P_s) for P_s in P):
         return P
     eigenvalues = np.linalg.eigvalsh(P)
     shift = 2.0 * max(-float(eigenvalues.min()), 0.0) + 1e-9 * float(np.abs(eigenvalues).max())
     return np.asarray(P + (shift or 1.0) * np.eye(P.shape[-1]))
 
 
-def _positive(P: Array) -> bool:
+def positive(P: Array) -> bool:
+    """Whether P is positive definite, by Cholesky and without an allowance for rounding."""
     try:
         np.linalg.cholesky(P)
     except np.linalg.LinAlgError:

@@ -2,8 +2,9 @@
 
 The arithmetic is float64 with an allowance for its own rounding, so that "holds" is a statement about the exact
 matrices, not about the computed ones. A matrix S that should be positive definite is computed as S_float, with
-every entry off by at most `allowance` (see `_allowance`). Then S_float - (norm of allowance) I is given to
-Cholesky: if that runs to its end with the diagonal lowered once more by the rounding of Cholesky itself, S is
+every entry off by at most `allowance` (see `_allowance`). No symmetric matrix of such errors lies below
+-diag(row sums of allowance), by Gershgorin's theorem, so S_float with its diagonal lowered by these sums is given
+to Cholesky: if that runs to its end with the diagonal lowered once more by the rounding of Cholesky itself, S is
 positive definite (Rump, BIT Numerical Mathematics 46, 2006: a symmetric matrix whose floating-point Cholesky ends
 is at most (m + 1) u trace away from a positive semidefinite one).
 """
@@ -19,7 +20,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, listed
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.error_model import ErrorModel, error_model, stacked_gains, stacks
+from designer.error_model import ErrorModel, error_model, measurement_slices, stacked_gains, stacks
 
 ARITHMETIC = "float64, Cholesky with an a-priori allowance for rounding"
 _U = 2.0**-53
@@ -36,9 +37,11 @@ class Verdict(NamedTuple):
 
 
 def verify(gains: Gains) -> Verdict:
-    """Check Theorem 1 for everything as it stands in the gains file."""
-    if gains.certificate.kind != "lyapunov":
-        raise InputError(f'the certificate is of kind "{gains.certificate.kind}"; this check is for kind "lyapunov"')
+    """Check Theorem 1, or the exact gain, for everything as it stands in the gains file."""
+    if gains.certificate.kind == "exact":
+        from designer.exact_certificate import verify_exact  # it is built on this module
+
+        return verify_exact(gains)
     K_bar, H_bar = stacked_gains(gains)
     return check(gains.problem, K_bar, H_bar, P=lyapunov_matrix(gains), gamma=gains.certificate.gamma)
 
@@ -114,7 +117,8 @@ def _magnitudes(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     A[:, nx:, :nx] = (np.abs(bar.A) + K) @ ones
     A[:, nx:, nx:] = K + H @ np.abs(bar.C_beta)
     B[:, nx:] = np.abs(bar.B) + H @ np.abs(bar.D)
-    F = np.stack([H @ np.abs(E_i) @ ones for E_i in bar.E], axis=1)
+    measured = zip(measurement_slices(problem), problem.nodes, strict=True)
+    F = np.stack([H[:, :, rows] @ np.abs(node.C) for rows, node in measured], axis=1)
     return ErrorModel(A, B, F, np.abs(model.M), model.beta, model.alpha, model.transition, nx)
 
 
@@ -143,8 +147,7 @@ def _positive_definite(S: Array, allowance: Array) -> tuple[bool, float]:
     scale = np.exp2(np.round(-np.log2(diagonal) / 2.0))
     S, allowance = S * scale * scale[:, None], allowance * scale * scale[:, None]
     order = len(S)
-    shift = float(allowance.sum(axis=1).max()) + 2.0 * (order + 2) * _U * float(np.trace(S))
-    lowered = S - shift * np.eye(order)
+    lowered = S - np.diag(allowance.sum(axis=1) + 2.0 * (order + 2) * _U * float(np.trace(S)))
     try:
         np.linalg.cholesky(lowered)
     except np.linalg.LinAlgError:

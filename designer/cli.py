@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -22,8 +22,12 @@ from agent.contract.files import refuse_overwrite
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
+    from designer.descent import Progress
 
-METHODS = "theorem2 (the default): the LMI of Zhu et al. 2020; theorem2-reduced: the same for [x; e], faster"
+METHODS = (
+    "theorem2 (the default): the LMI of Zhu et al. 2020; theorem2-reduced: the same for [x; e], faster; "
+    "decomposed: the same optimum node by node, for large networks; exact: the least exact gain that descent finds"
+)
 PROBLEM = "problem file, or the name of a built-in problem (peakmesh show lists them)"
 
 
@@ -112,7 +116,7 @@ def _design(problem: Problem, method: str, output: Path | None, *, force: bool) 
     refuse_overwrite(path, force=force)
     from designer.synthesis import design  # only now: it loads a solver
 
-    gains = design(problem, method=method)
+    gains = design(problem, method=method, progress=_descent_progress())
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {
@@ -130,15 +134,35 @@ def _design(problem: Problem, method: str, output: Path | None, *, force: bool) 
 
 
 def _design_text(result: dict[str, Any]) -> str:
-    solver = result["solver"]
+    solver, exact = result["solver"], result["exact"]
+    lmi = "" if result["lmi_gamma"] is None else f" (the solver's value of the LMI {result['lmi_gamma']:.6f})"
+    ladder = [f"floor {result['floor']:.6f}"] if result["floor"] is not None else []
+    ladder += [f"what these gains really have {exact[1]:.6f}"] if exact is not None else []
     return (
-        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified "
-        f"(optimum of the LMI {result['lmi_gamma']:.6f})\n"
+        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified{lmi}\n"
+        f"ladder     {' <= '.join([*ladder, 'gamma'])}\n"
         f"{solver['name']} {solver['version']}: {solver['status']}, {solver['iterations']} iterations; "
         f"{result['seconds']['total']:.1f} s in all\n"
         f"gains      {result['output']}\n"
         f"next       peakmesh run {result['output']}"
     )
+
+
+def _descent_progress() -> Callable[[Progress], None]:
+    """Prints where the descent is, every other second."""
+    shown = 0.0
+
+    def show(progress: Progress) -> None:
+        nonlocal shown
+        if progress.seconds >= shown + 2.0:
+            shown = progress.seconds
+            print(
+                f"{progress.seconds:5.0f} s  from {progress.start}: gamma < {progress.gamma:.6f} "
+                f"after {progress.steps} steps; Ctrl-C keeps the best so far",
+                file=sys.stderr,
+            )
+
+    return show
 
 
 # verify

@@ -11,6 +11,7 @@ states it is 5 MB for four modes, where the matrices as printed would take gigab
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -53,29 +54,37 @@ class Stacks:
     C_beta: Array  # (sum ny, n nx): C_bar_beta
     D: Array  # (sum ny, nw): D_bar
     M: Array  # (n nz, n nx): M_bar
-    E: list[Array]  # E[i] = E_n^i, (sum ny, n nx): C_i in block i, else zero
     beta: Array  # (n,)
     alpha: Array  # (n,), eq. (3)
+    rows: list[slice]  # of each node's measurements
+
+    @cached_property
+    def E(self) -> list[Array]:
+        """E[i] = E_n^i, (sum ny, n nx): C_i in block i, else zero. Only for who asks: large networks do not."""
+        matrices = [np.zeros_like(self.C) for _ in self.rows]
+        for E_i, rows in zip(matrices, self.rows, strict=True):
+            E_i[rows] = self.C[rows]
+        return matrices
 
 
 def stacks(problem: Problem) -> Stacks:
     """A_bar, B_bar, C_bar_beta, D_bar, M_bar and E_n^i of (8)."""
-    plant, n, beta = problem.plant, problem.n, problem.beta
-    E = []
-    for i, rows in enumerate(measurement_slices(problem)):
-        E_i = np.zeros((rows_total(problem), n * problem.nx))
-        E_i[rows, i * problem.nx : (i + 1) * problem.nx] = problem.nodes[i].C
-        E.append(E_i)
+    plant, n, beta, nx = problem.plant, problem.n, problem.beta, problem.nx
+    slices = measurement_slices(problem)
+    C, C_beta = np.zeros((2, slices[-1].stop, n * nx))
+    for i, rows in enumerate(slices):
+        C[rows, i * nx : (i + 1) * nx] = problem.nodes[i].C
+        C_beta[rows] = beta[i] * C[rows]
     return Stacks(
         A=np.asarray(np.kron(np.eye(n), plant.A), dtype=np.float64),
         B=np.tile(plant.B, (n, 1)),
-        C=np.sum(E, axis=0),
-        C_beta=np.sum([beta_i * E_i for beta_i, E_i in zip(beta, E, strict=True)], axis=0),
+        C=C,
+        C_beta=C_beta,
         D=np.vstack([node.D for node in problem.nodes]),
         M=np.asarray(np.kron(np.eye(n), plant.M), dtype=np.float64),
-        E=E,
         beta=beta,
         alpha=beta * (1.0 - beta),
+        rows=slices,
     )
 
 

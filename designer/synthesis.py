@@ -5,34 +5,47 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, Unattainable, listed
-from agent.contract.gains import Certificate, Gains
+from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.back_off import Confirmed, back_off
-from designer.error_model import link_gains, stacked_links
+from designer.back_off import Confirmed, back_off, positive
+from designer.certificate import check, least_gamma
+from designer.descent import Progress
+from designer.error_model import link_gains, stacked_links, stacks
+from designer.exact_design import design_exact, with_ladder
+from designer.inwards import inwards
 from designer.lmi import LmiSolution
 
 
-def design(problem: Problem, *, method: str = "theorem2") -> Gains:
+class Designed(NamedTuple):
+    """Gains, and what the check says of them."""
+
+    K: LinkMatrices
+    H: LinkMatrices
+    confirmed: Confirmed
+
+
+def design(problem: Problem, *, method: str = "theorem2", progress: Callable[[Progress], None] | None = None) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
+    `progress` is called during the method "exact" only, which also returns its best gains on KeyboardInterrupt.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found.
     """
-    if method not in METHODS:
-        raise InputError(f'method "{method}" does not exist; the methods are {listed(METHODS)}')
+    if method not in METHODS and method != EXACT:
+        raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
     if not problem.plant.M.any():
         raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
+    if method == EXACT:
+        return design_exact(problem, progress=progress)
     started = time.perf_counter()
     solution = METHODS[method](problem)
     solved = time.perf_counter()
-    K_bar, H_bar = recover(problem, solution)
-    _refuse_non_numbers(problem, solution, K_bar, H_bar)
-    K, H = link_gains(problem, K_bar, H_bar)
-    confirmed = _confirm(problem, *stacked_links(problem, K, H), solution)  # as a reader of the file will have them
+    K, H, confirmed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(problem, solution)
     ended = time.perf_counter()
     return Gains(
         problem=problem,
@@ -40,7 +53,7 @@ def design(problem: Problem, *, method: str = "theorem2") -> Gains:
         method=method,
         K=K,
         H=H,
-        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
+        certificate=with_ladder(problem, K, H, _certificate(problem, confirmed, lmi_gamma=solution.gamma)),
         solver=solution.solver,
         seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
     )
@@ -71,17 +84,38 @@ def block_diagonal(R: Array, Q: Array) -> Array:
     return P.reshape(modes, nx * (n + 1), nx * (n + 1))
 
 
-def _confirm(problem: Problem, K_bar: Array, H_bar: Array, solution: LmiSolution) -> Confirmed:
-    """The gains' P and gamma, backed off until the check confirms them; or Unattainable."""
-    confirmed = back_off(problem, K_bar, H_bar, block_diagonal(solution.R, solution.Q))
+def _confirm(problem: Problem, solution: LmiSolution) -> Designed:
+    """The solver's own gains; their P and gamma backed off until the check confirms them; or Unattainable."""
+    K, H = _links(problem, solution)
+    # the check sees the gains as a reader of the file will have them
+    confirmed = back_off(problem, *stacked_links(problem, K, H), block_diagonal(solution.R, solution.Q))
     if not confirmed.verdict.holds:
         raise _unconfirmed(problem, solution, confirmed.verdict.failure)
-    return confirmed
+    return Designed(K, H, confirmed)
 
 
-def _refuse_non_numbers(problem: Problem, solution: LmiSolution, K_bar: Array, H_bar: Array) -> None:
+def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
+    """Gains and P together a little inside the LMI, so that P keeps its form; None: not confirmed that way."""
+    M = np.hstack([np.zeros((problem.n * problem.nz, problem.nx)), stacks(problem).M])
+    for t in STEPS_INWARDS:
+        moved = inwards(problem, solution, t)
+        K, H = _links(problem, moved)
+        P = block_diagonal(moved.R, moved.Q)
+        if not all(positive(P_s) for P_s in P):
+            continue
+        gamma = least_gamma(M, P) * (1.0 + 1e-9 + t / 100.0)  # so that (18) is strict
+        verdict = check(problem, *stacked_links(problem, K, H), P=P, gamma=gamma)
+        if verdict.holds:
+            return Designed(K, H, Confirmed(P, "structured", t, verdict))
+    return None
+
+
+def _links(problem: Problem, solution: LmiSolution) -> tuple[LinkMatrices, LinkMatrices]:
+    """The gains of every link; Unattainable where they are not numbers."""
+    K_bar, H_bar = recover(problem, solution)
     if not (np.isfinite(K_bar).all() and np.isfinite(H_bar).all() and math.isfinite(solution.gamma)):
         raise _unconfirmed(problem, solution, "some of its numbers are not finite")
+    return link_gains(problem, K_bar, H_bar)
 
 
 def _unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Unattainable:
@@ -128,7 +162,20 @@ def _theorem2_reduced(problem: Problem) -> LmiSolution:
     return theorem2.solve(problem, reduced=True)
 
 
+def _decomposed(problem: Problem) -> LmiSolution:
+    from designer.lmi import decomposed
+
+    return decomposed.solve(problem)
+
+
+EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 METHODS: dict[str, Callable[[Problem], LmiSolution]] = {
     "theorem2": _theorem2,  # (36)(37) as printed
     "theorem2-reduced": _theorem2_reduced,  # the same for the state [x; e]: faster, gamma equal or slightly lower
+    "decomposed": _decomposed,  # the same optimum as theorem2-reduced, node by node: for large networks
 }
+
+# Methods whose gains may be moved a little together with P: their P stays small enough to store for large networks.
+# The others are the paper's, and their gains stay as the solver gave them.
+MOVABLE = frozenset({"decomposed"})
+STEPS_INWARDS = (0.0, 1e-6, 3e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)

@@ -28,7 +28,7 @@ WHO_MAY_IMPORT = {
     "zstandard": ["agent/contract/recording.py"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": [],
+    "scipy": ["designer/lmi/"],
     "matplotlib": ["designer/figures.py"],
     "rich": ["agent/cli.py", "designer/cli.py"],
 }

@@ -27,7 +27,11 @@ Document = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def gains() -> Gains:
-    return design(find("zhu2020-lossy"), method="theorem2-reduced")
+    """A certificate with P in full."""
+    designed = design(find("zhu2020-lossy"), method="theorem2-reduced")
+    P = dict(zip(designed.problem.mode_names, lyapunov_matrix(designed), strict=True))
+    proved = designed.certificate.model_copy(update={"form": "full", "P": P, "R": None, "Q": None})
+    return designed.model_copy(update={"certificate": proved})
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from made_recordings import record, simulate
 from agent.contract.gains import Gains
 from designer.cli import main
 from designer.problems import names
-from designer.synthesis import METHODS
+from designer.synthesis import EXACT, METHODS
 
 ROOT = Path(__file__).parents[1]
 
@@ -144,7 +144,7 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         run("design", "--help")
     helped = capsys.readouterr().out
-    assert all(f"{method} " in helped or f"{method}:" in helped for method in METHODS)
+    assert all(f"{method} " in helped or f"{method}:" in helped for method in (*METHODS, EXACT))
     assert run("design", "two-nodes", "--method", "magic", "-o", "never.json") == 2
     assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
     assert not Path("never.json").exists()

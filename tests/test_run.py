@@ -218,7 +218,7 @@ def test_killed_recorder_leaves_what_it_flushed(gains_path: Path, tmp_path: Path
         kill("recorder")()
 
     with pytest.raises(RunBroken, match=r"the recorder was lost: .*; \d+ steps were complete"):
-        run_here(gains_path, recording, at=200, do=kill_recorder)
+        run_here(gains_path, recording, at=800, do=kill_recorder)
     part = recording.with_name("run.mcap.part")
     assert end_of(part) is None
     assert killed - max(message.log_time for message in logged(part)) < 0.5e9

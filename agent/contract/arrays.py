@@ -21,8 +21,11 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
 
     def document(self) -> Any:
-        """The model as plain lists, dicts, strings and numbers, under the names used in files."""
-        return self.model_dump(by_alias=True)
+        """The model as plain lists, dicts, strings and numbers, under the names used in files.
+
+        What is None is left out, so that the digest of a file stays what it is when a later version knows more.
+        """
+        return self.model_dump(by_alias=True, exclude_none=True)
 
     def canonical(self) -> bytes:
         """Canonical JSON: equal models have equal bytes, float64 bit for bit."""

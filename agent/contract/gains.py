@@ -27,6 +27,7 @@ class Solver(Model):
     version: str
     status: str
     iterations: int
+    residuals: tuple[Number, Number] | None = None  # primal and dual, as the solver measures them
     seconds: float
 
 

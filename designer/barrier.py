@@ -1,0 +1,100 @@
+"""The log-det barrier of the exact gain over a horizon T, a smooth function of the gains; and its gradient.
+
+With y = log g,
+
+    J(K, H, y) = y - mu sum over steps and modes of log det (I - B'Y_bar B / g)
+
+is finite exactly where gamma_T^2 < g, and costs one sweep and one covariance: gamma_T itself is never searched for.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.problem import Problem
+from designer import bfgs
+from designer.error_model import error_model, measurement_slices, rows_total
+from designer.gain import Operator
+from designer.sensitivity import Inputs, slope, sweep
+
+StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny)
+
+
+class Entries:
+    """The entries of K_bar and H_bar that the topologies allow, as one vector."""
+
+    def __init__(self, problem: Problem) -> None:
+        nx, columns, modes = problem.nx, measurement_slices(problem), len(problem.topologies)
+        self.K = np.zeros((modes, problem.n * nx, problem.n * nx), dtype=bool)
+        self.H = np.zeros((modes, problem.n * nx, rows_total(problem)), dtype=bool)
+        for s in range(modes):
+            for i in range(problem.n):
+                rows = slice(i * nx, (i + 1) * nx)
+                for j in problem.neighbours(s, i):
+                    self.K[s, rows, j * nx : (j + 1) * nx] = True
+                    self.H[s, rows, columns[j]] = True
+
+    def pack(self, K_bar: Array, H_bar: Array) -> Array:
+        """All K entries, then all H entries."""
+        return np.concatenate([K_bar[self.K], H_bar[self.H]])
+
+    def unpack(self, v: Array) -> StackedGains:
+        """The inverse of `pack`, zero elsewhere."""
+        K_bar, H_bar = np.zeros(self.K.shape), np.zeros(self.H.shape)
+        split = np.count_nonzero(self.K)
+        K_bar[self.K], H_bar[self.H] = v[:split], v[split:]
+        return K_bar, H_bar
+
+
+class Barrier:
+    """J and what it is made of, for one problem and horizon; x = [v; y] holds the gains' entries and y = log g."""
+
+    def __init__(self, problem: Problem, horizon: int) -> None:
+        self.problem, self.horizon = problem, horizon
+        self.entries, self.inputs = Entries(problem), Inputs(problem)
+
+    def operator(self, v: Array) -> Operator:
+        """The error model of the gains v."""
+        return Operator(error_model(self.problem, *self.entries.unpack(v)))
+
+    def descent(self, mu: float) -> bfgs.Function:
+        """J(v, y), whose minimum goes to that of log gamma_T^2 as mu goes to 0."""
+
+        def J(x: Array) -> tuple[float, Array]:
+            log_det, gradient = self._log_det(x)
+            gradient = -mu * gradient
+            gradient[-1] += 1.0
+            return float(x[-1]) - mu * log_det, gradient
+
+        return J
+
+    def centre(self, y: float, scale: float) -> bfgs.Function:
+        """The same with g held, and the size of the gains in place of y: -sum of log det + |v|^2 / scale^2.
+
+        The sum is least where the responses of all horizons together are small: for gains that decay fast.
+        """
+
+        def J(v: Array) -> tuple[float, Array]:
+            log_det, gradient = self._log_det(np.append(v, y))
+            ridge = v / scale
+            return float(ridge @ ridge) - log_det, 2.0 * ridge / scale - gradient[:-1]
+
+        return J
+
+    def _log_det(self, x: Array) -> tuple[float, Array]:
+        """The sum of log det (I - B'Y_bar B / g) and its gradient in [v; y]; minus infinity where gamma_T^2 >= g."""
+        v, y = x[:-1], float(x[-1])
+        swept = None
+        if abs(y) < 300.0 and np.abs(v).max() < 1e50:  # beyond, squares overflow
+            operator, g = self.operator(v), math.exp(y)
+            swept = sweep(operator, g, self.horizon)
+        if swept is None:
+            return -math.inf, np.zeros_like(x)
+        slopes = slope(operator, self.inputs, swept, swept.W_inverse)
+        traces = float(np.trace(swept.W_inverse, axis1=2, axis2=3).sum())
+        count = swept.Gamma.shape[0] * swept.Gamma.shape[1] * operator.nw
+        down = self.entries.pack(slopes.K_bar, slopes.H_bar)
+        return swept.log_det, np.append(-down, g * (traces - slopes.g) - count)

@@ -1,0 +1,139 @@
+"""From a problem to gains designed for the exact gain, with a certificate of kind "exact"; and the ladder of any gains.
+
+The ladder: floor <= exact gain <= certified gamma <= Theorem 2's gamma, where that was computed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.errors import Unattainable
+from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
+from agent.contract.problem import Problem
+from designer.barrier import StackedGains
+from designer.certificate import Verdict
+from designer.consensus import consensus_gains
+from designer.descent import Descent, Progress, descend
+from designer.error_model import error_model, link_gains, stacked_links
+from designer.exact_certificate import check_exact
+from designer.floor import floor
+from designer.gain import Gain, exact_gain
+
+_CONSENSUS_WEIGHTS = (0.2, 0.4)
+_LMI_STATES = 8  # n nx up to which Theorem 2, a second or two there, gives one more start
+_LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
+_ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
+
+
+def design_exact(problem: Problem, *, progress: Callable[[Progress], None] | None = None) -> Gains:
+    """Gains with the least exact gain that is found. KeyboardInterrupt ends the search; the best so far is returned."""
+    started = time.perf_counter()
+    starts, lmi_gamma = _starts(problem)
+    begun = time.perf_counter()
+    descent = descend(problem, starts, progress=progress)
+    solved = time.perf_counter()
+    chosen = descent.chosen
+    K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
+    certificate = _certificate(problem, *stacked_links(problem, K, H), lmi_gamma=lmi_gamma)
+    ended = time.perf_counter()
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method="exact",
+        K=K,
+        H=H,
+        certificate=certificate,
+        solver=Solver(
+            name="barrier descent, numpy",
+            version=np.__version__,
+            status=_status(descent),
+            iterations=descent.steps,
+            seconds=solved - begun,
+        ),
+        seconds={
+            "starts": begun - started,
+            "solve": solved - begun,
+            "certify": ended - solved,
+            "total": ended - started,
+        },
+    )
+
+
+def with_ladder(problem: Problem, K: LinkMatrices, H: LinkMatrices, certificate: Certificate) -> Certificate:
+    """The certificate with the exact gain of the gains, unless the network is large, and the floor."""
+    exact = None
+    if problem.n * problem.nx <= _LADDER_STATES:
+        gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
+        exact = (gain.low, gain.high) if gain.stable else None
+    return certificate.model_copy(update={"exact": exact, "floor": floor(problem)})
+
+
+def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
+    """Gains to start from, and gamma of Theorem 2 where that is one of them."""
+    starts = {f"consensus {weight}": consensus_gains(problem, weight=weight) for weight in _CONSENSUS_WEIGHTS}
+    if problem.n * problem.nx > _LMI_STATES:
+        return starts, None
+    from designer.lmi import theorem2  # cvxpy takes seconds to import
+    from designer.synthesis import recover
+
+    try:
+        solution = theorem2.solve(problem, reduced=True)
+        gains = recover(problem, solution)
+    except Unattainable:
+        return starts, None  # one start less
+    if np.isfinite(gains[0]).all() and np.isfinite(gains[1]).all():
+        starts["theorem2"] = gains
+    return starts, solution.gamma
+
+
+def _certificate(problem: Problem, K_bar: Array, H_bar: Array, *, lmi_gamma: float | None) -> Certificate:
+    """gamma just above the exact gain, as the check confirms it; or Unattainable."""
+    gain = exact_gain(error_model(problem, K_bar, H_bar))
+    if gain.P is None:
+        raise Unattainable(
+            f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
+            f"{gain.radius:.6g} in each step; try --method theorem2"
+        )
+    verdict = _confirmed(problem, K_bar, H_bar, gain, gain.P)
+    if not verdict.holds:
+        raise Unattainable(
+            f"the exact gain {gain.high:.6g} of the gains found for {problem.name} is not confirmed by the check "
+            f"({verdict.failure}); try the problem in other units, so that its numbers are near 1"
+        )
+    return Certificate(
+        gamma=verdict.gamma,
+        kind="exact",
+        form="full",
+        P=dict(zip(problem.mode_names, gain.P, strict=True)),
+        horizon=gain.horizon,
+        lmi_gamma=lmi_gamma,
+        exact=(gain.low, gain.high),
+        floor=floor(problem),
+        holds=verdict.holds,
+        verified=f"(17) for P, the recursion of the exact gain over the horizon and its tail: {verdict.arithmetic}",
+        margins=verdict.margins,
+    )
+
+
+def _confirmed(problem: Problem, K_bar: Array, H_bar: Array, gain: Gain, P: Array) -> Verdict:
+    for factor in _ABOVE:
+        gamma = gain.high * factor
+        verdict = check_exact(problem, K_bar, H_bar, P=P, gamma=gamma, horizon=gain.horizon)
+        if verdict.holds:
+            break
+    return verdict
+
+
+def _status(descent: Descent) -> str:
+    """What was found from where, and what the chosen gains trade for their size and decay."""
+    found = ", ".join(f"{name} {gamma:.6g}" for name, gamma in descent.starts.items())
+    chosen, least = descent.chosen, descent.least
+    return (
+        f"{'interrupted' if descent.interrupted else 'converged'}; starts led to {found or 'nothing yet'}; "
+        f"least {least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
+        f"chosen {chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
+    )

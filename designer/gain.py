@@ -1,0 +1,229 @@
+"""The exact gain of given gains: the least gamma of which sup_k E|z_tilde(k)|^2 <= gamma^2 E sum |w|^2 is true.
+
+w(k) may depend on the modes r(0..k) and on everything before step k, but not on theta(k) or on later modes; the
+initial mode is any, the initial error is 0. That is the class that Theorem 1 covers. docs/theory.md derives what
+is written here; the letters are those of eqs. (10)(11), and everything is scaled so that g stands for gamma^2.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from designer.error_model import ErrorModel
+
+_WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
+_TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
+_UNSTABLE_HORIZON = 30  # where no horizon suffices
+_MOST_STEPS = 20_000
+_STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
+
+
+class Gain(NamedTuple):
+    """gamma lies in [low, high]: low = gamma_T, high^2 = gamma_T^2 + tau_T^2, T = horizon.
+
+    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None.
+    """
+
+    low: float
+    high: float
+    horizon: int
+    tail: float  # tau_T^2
+    P: Array | None  # (modes, n_eta, n_eta), satisfies (17) strictly; the tail is measured by it
+    radius: float  # spectral radius of the operator L of `Operator.corner`: what E|eta|^2 is multiplied by, per step
+
+    @property
+    def stable(self) -> bool:
+        """Whether the error system is mean-square stable."""
+        return math.isfinite(self.high)
+
+
+class Operator:
+    """The matrices of (10)(11) in the shapes that the recursions multiply by."""
+
+    def __init__(self, model: ErrorModel) -> None:
+        modes, size, p = len(model.A), model.A.shape[1], model.plant_states
+        self.AB = np.concatenate([model.A, model.B], axis=2)  # (modes, n_eta, n_eta + nw)
+        self.AB_T = np.ascontiguousarray(self.AB.swapaxes(1, 2))
+        self.lossy = np.flatnonzero(model.alpha > 0.0)
+        scaled = np.sqrt(model.alpha[self.lossy])[:, None, None] * model.F[:, self.lossy]  # (modes, lossy, n nx, p)
+        self.F = np.ascontiguousarray(scaled.transpose(0, 2, 1, 3)).reshape(modes, size - p, -1)  # [sqrt(alpha_i) F_i]
+        self.F_T = self.F.reshape(modes, -1, p).swapaxes(1, 2)
+        self.MM = np.broadcast_to(model.M.T @ model.M, (modes, size, size))
+        self.M = model.M
+        self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
+        self.p, self.size, self.nw = p, size, model.B.shape[2]
+        self.eye_w = np.eye(self.nw)
+
+    def bar(self, Y: Array) -> Array:
+        """Y_bar(s) = sum_t pi_st Y(t), (modes, n_eta, n_eta)."""
+        return np.asarray((self.transition @ Y.reshape(len(Y), -1)).reshape(Y.shape))
+
+    def joint(self, Y_bar: Array) -> Array:
+        """[A B]'Y_bar[A B], its upper left corner with the sum of alpha_i F_i'Y_bar F_i: what E|eta(k+1)|^2 weighs."""
+        S = self.AB_T @ (Y_bar @ self.AB)
+        if len(self.lossy):
+            YF = Y_bar[:, self.p :, self.p :] @ self.F
+            S[:, : self.p, : self.p] += self.F_T @ YF.reshape(len(YF), -1, self.p)
+        return np.asarray(S)
+
+    def corner(self, Y: Array) -> Array:
+        """L(Y) = A'Y_bar A + sum of alpha_i F_i'Y_bar F_i, the mean of Y one step later, (modes, n_eta, n_eta)."""
+        return self.joint(self.bar(Y))[:, : self.size, : self.size]
+
+
+class Sweep(NamedTuple):
+    """The recursion at g, from the end of the horizon backwards; row 0 is the last step. Rows of modes."""
+
+    Y_bar: Array  # (T, modes, n_eta, n_eta)
+    W: Array  # (T, modes, nw, nw): g I - B'Y_bar B
+    Gamma: Array  # (T, modes, nw, n_eta): worst w = Gamma eta
+
+
+def horizon_holds(operator: Operator, g: float, horizon: int) -> tuple[bool, float]:
+    """Whether gamma_T^2 <= g: every W positive definite; and sum_k min_s log det(W / g), a measure of how far."""
+    Y, size, total = operator.MM, operator.size, 0.0
+    for _ in range(horizon):
+        S = operator.joint(operator.bar(Y))
+        W = operator.eye_w - S[:, size:, size:] / g
+        try:
+            L = np.linalg.cholesky(W)
+        except np.linalg.LinAlgError:
+            return False, -math.inf
+        total += 2.0 * float(np.log(L.diagonal(axis1=1, axis2=2)).sum(axis=1).min())
+        half = np.linalg.solve(L, S[:, size:, :size])
+        Y = S[:, :size, :size] + half.swapaxes(1, 2) @ half / g
+    return True, total
+
+
+def exact_gain(model: ErrorModel) -> Gain:
+    """The exact gain of an error model, between bounds that differ by 1e-6 of it at most; T is chosen on the way."""
+    operator = Operator(model)
+    P, radius = lyapunov(operator)
+    if P is None:
+        low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
+        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, math.inf, None, radius)
+    horizon, tail = _horizon(operator, P)
+    low, _ = horizon_gain(operator, 2 * horizon // 3 + 1, width=_WIDTH / 2.0)
+    low, high = horizon_gain(operator, horizon, low=low)
+    return Gain(math.sqrt(low), math.sqrt(high + tail), horizon, tail, P, radius)
+
+
+def horizon_gain(operator: Operator, horizon: int, *, width: float = _WIDTH, low: float = 0.0) -> tuple[float, float]:
+    """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high.
+
+    A `low` that is known from a shorter horizon is mostly all but the answer, so the search begins just above it.
+
+    As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
+    recursion held give p and the root; where that leads nowhere, the bracket is halved.
+    """
+    growth = 1.0 + width if low else 2.0
+    g = growth * (low or max(_impulse(operator), np.finfo(float).tiny))
+    held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
+    while not held or held[-1][0] > low * (1.0 + 1.001 * width):
+        holds, measure = horizon_holds(operator, g, horizon)
+        if holds:
+            held = [*held[-2:], (g, measure)]
+        else:
+            low, growth = g, 1.0 + 8.0 * (growth - 1.0)
+        g = _next_trial(low, held, width, fit=holds) if held else growth * low
+    return low, held[-1][0]
+
+
+def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:
+    """Where to try g next, strictly inside the bracket: at the fitted root, or a tenth above low after that failed."""
+    high, step = held[-1][0], 0.4 * width
+    root = _root(low, held) if fit and len(held) == 3 else None
+    if high - low < 8.0 * width * high:  # close the bracket from the other side
+        root = (root or low) if high > low * (1.0 + 3.0 * step) else None
+    if root is None:
+        return math.sqrt(high * max(low, high / 1.5)) if fit else low + 0.1 * (high - low)
+    if high < root * (1.0 + step):
+        root = high * (1.0 - 2.0 * step)
+    elif low > root * (1.0 - step):
+        root = low * (1.0 + 2.0 * step)
+    return min(max(root, low * (1.0 + step)), high * (1.0 - step))
+
+
+def _root(low: float, held: list[tuple[float, float]]) -> float | None:
+    """r of measure = a + p log(g - r) through three points (g, measure); None if there is none above `low`."""
+    (g1, m1), (g2, m2), (g3, m3) = held
+
+    def excess(r: float) -> float:
+        return math.log((g1 - r) / (g2 - r)) * (m2 - m3) - math.log((g2 - r) / (g3 - r)) * (m1 - m2)
+
+    left, right = low, g3 * (1.0 - 1e-15)
+    if not (m1 > m2 > m3 and excess(left) > 0.0 > excess(right)):
+        return None
+    for _ in range(50):
+        middle = (left + right) / 2.0
+        left, right = (middle, right) if excess(middle) > 0.0 else (left, middle)
+    return left
+
+
+def _impulse(operator: Operator) -> float:
+    """gamma_1^2: the gain of one step of w."""
+    return float(np.linalg.eigvalsh(operator.joint(operator.MM)[:, operator.size :, operator.size :]).max())
+
+
+def lyapunov(operator: Operator) -> tuple[Array | None, float]:
+    """P(s) that satisfies (17) strictly, (modes, n_eta, n_eta), and the spectral radius of L.
+
+    P0 = I + L(I) + ... + L^k(I) with L^(k+1)(I) < I/2 has V = P0 - L(P0) > I/2. By Schur's complement c P0
+    satisfies (17) if and only if I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where the powers of L
+    grow, at a rate that has settled.
+    """
+    term = np.broadcast_to(np.eye(operator.size), operator.MM.shape)
+    P0, sizes = term.copy(), [0.0]  # logarithms of the norms of L^k(I)
+    while len(sizes) < _MOST_STEPS:
+        term = operator.corner(term)
+        largest = float(np.abs(term).sum(axis=2).max())
+        sizes.append(math.log(largest) if largest > 0.0 else -math.inf)
+        if largest < 0.5:  # a bound on every eigenvalue
+            return _scaled(operator, P0, term), _rate(sizes)
+        if _grows(sizes):
+            break
+        P0 = P0 + term
+    return None, _rate(sizes)
+
+
+def _scaled(operator: Operator, P0: Array, last: Array) -> Array:
+    """c P0 with the largest c that (17) allows, but for the factor _STRICT; last = L^(k+1)(I)."""
+    V = np.eye(operator.size) - last  # P0 - L(P0)
+    S = operator.joint(operator.bar(P0))
+    AB, BB = S[:, : operator.size, operator.size :], S[:, operator.size :, operator.size :]
+    worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
+    return np.asarray(P0 / (worst * _STRICT))
+
+
+def _rate(sizes: list[float]) -> float:
+    """Growth per step over the last half."""
+    half = (len(sizes) - 1) // 2
+    return math.exp((sizes[-1] - sizes[half]) / (len(sizes) - 1 - half))
+
+
+def _grows(sizes: list[float]) -> bool:
+    """Whether the norms grow at a rate that has settled, so that it is no transient; asked at steps 32, 64, 128, ..."""
+    k = len(sizes) - 1
+    if k < 32 or k & (k - 1):
+        return False
+    early, late = sizes[k // 2] - sizes[k // 4], sizes[k] - sizes[k // 2]
+    return late > 0.0 and abs(late - 2.0 * early) < 0.02 * late
+
+
+def _horizon(operator: Operator, P: Array) -> tuple[int, float]:
+    """The first T at which tau_T^2 is small beside gamma^2, and tau_T^2 = max_s lambda_max(L^T(M'M) relative to P)."""
+    P_inverse = np.linalg.inv(P)
+    P_inverse = (P_inverse + P_inverse.swapaxes(1, 2)) / 2.0
+    Y, size, steps, impulse = operator.MM, operator.size, 0, 0.0
+    while steps < 2 or float((Y * P_inverse).sum(axis=(1, 2)).max()) > _TAIL * impulse:  # trace >= eigenvalue
+        S = operator.joint(operator.bar(Y))
+        impulse = max(impulse, float(np.linalg.eigvalsh(S[:, size:, size:]).max()))  # <= gamma^2: one step of w
+        Y, steps = S[:, :size, :size], steps + 1
+    L = np.linalg.cholesky(P)
+    half = np.linalg.solve(L, Y)
+    relative = np.linalg.solve(L, half.swapaxes(1, 2))
+    return steps, float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max())

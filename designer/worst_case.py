@@ -1,0 +1,96 @@
+"""The w that are worst: as a policy that sees the past, as a fixed sequence, and along one realised path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from designer.error_model import ErrorModel
+from designer.gain import Operator
+from designer.sensitivity import critical, critical_sweep
+
+
+class Policy(NamedTuple):
+    """Wait for mode s0 with w = 0, then give w = u in that step, and w = Gamma[k, r] eta in the steps after it.
+
+    Its |z_tilde|^2 one step after the last row is gamma^2 of its energy, in the mean.
+    """
+
+    gamma: float  # gamma_T
+    mode: int  # s0
+    u: Array  # (nw,)
+    Gamma: Array  # (steps, modes, nw, n_eta)
+
+
+def worst_policy(model: ErrorModel, *, horizon: int) -> Policy:
+    """The policy that attains gamma_T, T = horizon, to 1e-8; Gamma = W^-1 B'Y_bar A at g = gamma_T^2."""
+    operator = Operator(model)
+    g, swept = critical_sweep(operator, horizon)
+    k, s, u = critical(swept)
+    return Policy(math.sqrt(g), s, u, swept.Gamma[:k][::-1])
+
+
+class Disturbance(NamedTuple):
+    """The worst w that is fixed beforehand, of energy 1; |z_tilde|^2 peaks one step after its last row."""
+
+    gain: float  # sqrt of E|z_tilde|^2
+    w: Array  # (T, nw)
+
+
+def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Disturbance:
+    """max over T <= horizon of lambda_max(E[G_T'G_T]), G_T from w(0..T-1) to z_tilde(T), from r(0) = initial.
+
+    Block (j, l), j < l, of E[G_T'G_T] is E[eta_j(l)'A'Y_bar B], where eta_j is what w(j) left in the state, whose mean
+    in every mode moves by A alone (losses have mean 0), and Y = L^(T-1-l)(M'M) weighs what is left of it at T.
+    """
+    operator, nw, size = Operator(model), model.B.shape[2], model.A.shape[1]
+    joints, Y = [], np.asarray(operator.MM)  # joints[m]: [A B]'Y_bar [A B] with m steps to go afterwards
+    for _ in range(horizon):
+        joints.append(operator.joint(operator.bar(Y)))
+        Y = joints[-1][:, :size, :size]
+    left = _traces_of_w(operator, model, initial, horizon)
+    best = Disturbance(0.0, np.zeros((1, nw)))
+    for T in range(1, horizon + 1):
+        gram = np.zeros((T * nw, T * nw))
+        for k in range(T):
+            at = slice(k * nw, (k + 1) * nw)
+            means, occupied = left[k]
+            gram[at, at] = np.tensordot(occupied, joints[T - 1 - k][:, size:, size:], axes=1)
+            gram[: k * nw, at] = (means.swapaxes(1, 2) @ joints[T - 1 - k][:, :size, size:]).sum(axis=0)
+        eigenvalues, vectors = np.linalg.eigh(gram, UPLO="U")
+        if eigenvalues[-1] > best.gain**2:
+            best = Disturbance(math.sqrt(eigenvalues[-1]), vectors[:, -1].reshape(T, nw))
+    return best
+
+
+def _traces_of_w(operator: Operator, model: ErrorModel, initial: int, horizon: int) -> list[tuple[Array, Array]]:
+    """For every step k: E[eta_j(k); r(k) = s] for all j < k and unit w(j), (modes, n_eta, k nw), and P(r(k) = s)."""
+    modes, size, _ = model.B.shape
+    means, occupied = np.zeros((modes, size, 0)), np.eye(modes)[initial]
+    steps = [(means, occupied)]
+    for _ in range(horizon - 1):
+        moved = np.concatenate([model.A @ means, occupied[:, None, None] * model.B], axis=2)
+        means = (operator.transition.T @ moved.reshape(modes, -1)).reshape(moved.shape)
+        occupied = occupied @ operator.transition
+        steps.append((means, occupied))
+    return steps
+
+
+def path_gain(model: ErrorModel, modes: Sequence[int], theta: Array) -> Array:
+    """gamma_path(k), (steps + 1,), of one realised run: modes r(0), r(1), ... and theta (steps, n).
+
+    |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2 in that very run, with no expectation:
+    X <- A_k X A_k' + B_k B_k' from 0, with the realised theta in A_k, and gamma_path(k)^2 = lambda_max(M X M').
+    """
+    p, X = model.plant_states, np.zeros_like(model.A[0])
+    gains = [0.0]
+    for s, theta_k in zip(modes, theta, strict=True):
+        A_k = model.A[s].copy()
+        A_k[p:, :p] += np.tensordot(theta_k - model.beta, model.F[s], axes=1)
+        X = A_k @ X @ A_k.T + model.B[s] @ model.B[s].T
+        gains.append(math.sqrt(max(float(np.linalg.eigvalsh(model.M @ X @ model.M.T).max()), 0.0)))
+    return np.array(gains)

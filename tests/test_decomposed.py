@@ -1,0 +1,267 @@
+"""The decomposed LMI: the optimum of Theorem 2, its cone data against cvxpy, the solvers' failures, large networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import clarabel
+import cvxpy as cp
+import numpy as np
+import pytest
+from networks import random_problem
+
+from agent.contract.arrays import Array
+from agent.contract.errors import Unattainable
+from agent.contract.gains import Gains, Solver
+from agent.contract.problem import Problem
+from benchmarks.design import banded
+from designer.certificate import check, least_gamma, verify
+from designer.error_model import error_model
+from designer.inwards import inwards
+from designer.lmi import cliques, conic, decomposed, theorem2
+from designer.lmi.cones import Assembly
+from designer.lmi.witness import Witness, witness
+from designer.problems import find
+from designer.synthesis import block_diagonal, design, recover
+
+NETWORKS = [
+    find("zhu2020-ideal"),
+    find("zhu2020-lossy"),
+    random_problem(11),
+    random_problem(12, n=1, modes=1),
+    random_problem(13, n=4, nx=1, nw=3, nz=2, modes=1),
+    random_problem(14, n=2, nx=3, modes=3, lossy=False),
+    random_problem(15, n=4, nx=3, nz=2),
+    banded(6),
+]
+NAMES = ["ideal", "lossy", "weights", "one-node-one-mode", "one-mode", "no-loss", "three-states", "banded"]
+networks = pytest.mark.parametrize("problem", NETWORKS, ids=NAMES)
+
+
+@pytest.mark.parametrize("problem", NETWORKS[:-2], ids=NAMES[:-2])
+def test_the_optimum_is_that_of_theorem_2(problem: Problem) -> None:
+    """gamma equals the reduced Theorem 2's within 1e-4."""
+    gamma = decomposed.solve(problem).gamma
+    assert gamma == pytest.approx(theorem2.solve(problem, reduced=True).gamma, rel=1e-4)
+
+
+@pytest.mark.parametrize("problem", NETWORKS[1:4], ids=NAMES[1:4])
+def test_the_optimum_is_not_above_the_printed_one(problem: Problem) -> None:
+    """Theorem 2 with the paper's longer state has the same optimum or a slightly higher one."""
+    assert decomposed.solve(problem).gamma <= theorem2.solve(problem).gamma * (1.0 + 1e-4)
+
+
+@pytest.mark.parametrize("problem", NETWORKS[1:4], ids=NAMES[1:4])
+def test_the_optimum_is_that_of_the_witness(problem: Problem) -> None:
+    """The same LMI by cvxpy, without cliques and with every S_i: the same gamma."""
+    written = witness(problem)
+    written.problem.solve(solver=cp.CLARABEL)
+    assert decomposed.solve(problem).gamma == pytest.approx(np.sqrt(written.delta.value), rel=1e-5)
+
+
+@networks
+def test_the_inequalities_are_the_witnesses_at_random_points(problem: Problem) -> None:
+    """Wherever the unknowns are: node, link, peak and balance (the sum of its pieces) are the same matrices."""
+    lmi, written = decomposed.assemble(problem), witness(problem)
+    u = np.random.default_rng(0).normal(size=lmi.cones.A.shape[1])
+    give(written, lmi, u)
+    nx, nw = problem.nx, problem.nw
+    for mode, same in zip(lmi.modes, written.modes, strict=True):
+        total = np.zeros(same.balance.shape)
+        for piece in mode.balance:
+            vertices = tuple(piece.at)
+            into = np.concatenate([np.arange(nx + nw) if v == 0 else nx * v + nw + np.arange(nx) for v in vertices])
+            rows = piece.rows(vertices)
+            total[np.ix_(into, into)] += piece.matrix.value(u)[np.ix_(rows, rows)]
+        np.testing.assert_allclose(total, same.balance.value, atol=1e-12)
+        for part, node in zip(mode.nodes, same.nodes, strict=True):
+            value, at = part.matrix.value(u), np.concatenate([part.rows, part.last])
+            order = len(part.rows)
+            np.testing.assert_allclose(value[np.ix_(at, part.last)], node.value[:, order:], atol=1e-12)
+            if part.S is not None:
+                np.testing.assert_allclose(value, node.value, atol=1e-12)
+        assert set(mode.links) == set(same.links)
+        for link, matrix in mode.links.items():
+            np.testing.assert_allclose(matrix.value(u), same.links[link].value, atol=1e-12)
+        for matrix, peak in zip(mode.peaks, same.peaks, strict=True):
+            np.testing.assert_allclose(matrix.value(u), peak.value, atol=1e-12)
+
+
+def give(written: Witness, lmi: decomposed.Lmi, u: Array) -> None:
+    """Give the witness the values that stand in u; S_i is 0 where a piece of the balance stands for it."""
+    written.delta.save_value(u[lmi.delta].item())
+    written.R.save_value(u[lmi.R])
+    for mode, same in zip(lmi.modes, written.modes, strict=True):
+        for Q_i, variable in zip(mode.Q, same.Q, strict=True):
+            variable.save_value(u[Q_i])
+        for part, variable in zip(mode.nodes, same.S, strict=True):
+            variable.save_value(np.zeros(variable.shape) if part.S is None else u[part.S])
+        for ours, theirs in ((mode.X, same.X), (mode.Y, same.Y), (mode.T, same.T)):
+            assert set(ours) == set(theirs)
+            for link, variable in theirs.items():
+                variable.save_value(u[ours[link]])
+
+
+def test_the_cone_data_are_the_inequalities() -> None:
+    """b - A u holds the upper triangles with off-diagonal entries times sqrt(2): the sums of squares agree."""
+    lmi = decomposed.assemble(random_problem(11))
+    u = np.random.default_rng(1).normal(size=lmi.cones.A.shape[1])
+    left = lmi.cones.b - lmi.cones.A @ u
+    squares = np.sum(u[lmi.R] ** 2) + sum(np.sum(matrix.value(u) ** 2) for matrix in dict.fromkeys(everything(lmi)))
+    assert np.sum(left**2) == pytest.approx(squares)
+
+
+def everything(lmi: decomposed.Lmi) -> list[Any]:
+    """All inequalities; one that serves a node as well as the balance is there twice."""
+    return [
+        matrix
+        for mode in lmi.modes
+        for matrix in (
+            *(piece.matrix for piece in mode.balance),
+            *(part.matrix for part in mode.nodes),
+            *mode.links.values(),
+            *mode.peaks,
+        )
+    ]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_cliques_hold_every_group_and_form_a_tree(seed: int) -> None:
+    """Each group lies in a clique; what is shared lies in both; the cliques that hold a vertex hang together."""
+    rng = np.random.default_rng(seed)
+    groups = [[int(v) for v in 1 + rng.choice(12, size=rng.integers(1, 4), replace=False)] for _ in range(10)]
+    tree = cliques.clique_tree(groups)
+    assert all(any(set(group) <= set(clique.vertices) for clique in tree) for group in groups)
+    assert sum(clique.above is None for clique in tree) == 1
+    for clique in tree:
+        if clique.above is None:
+            assert clique.shared == ()
+            continue
+        assert 0 in clique.shared
+        assert set(clique.shared) == set(clique.vertices) & set(tree[clique.above].vertices)
+    for v in {v for clique in tree for v in clique.vertices}:
+        assert sum(v in clique.vertices and v not in clique.shared for clique in tree) == 1
+
+
+@networks
+def test_designs_are_confirmed_with_a_small_certificate(problem: Problem) -> None:
+    """The check holds, P is diag{R, Q(s)}, gamma is near the optimum, also after a round trip through the file."""
+    gains = design(problem, method="decomposed")
+    proved = gains.certificate
+    assert proved.form == "structured"
+    assert proved.lmi_gamma is not None
+    assert proved.lmi_gamma * (1.0 - 1e-5) <= proved.gamma <= proved.lmi_gamma * (1.0 + 1e-4)
+    assert verify(Gains.from_bytes(gains.canonical(), source="memory")).holds
+    assert gains.solver.residuals is not None
+    assert max(gains.solver.residuals) < 1e-6
+
+
+def test_the_idle_network_is_strictly_inside() -> None:
+    """All weight on the network that ignores everything: K_ii = A, H = 0, and the check holds with room to spare."""
+    problem = random_problem(11)
+    solution = decomposed.solve(problem)
+    idle = inwards(problem, solution, 1.0)
+    assert not idle.X.any()
+    K_bar, H_bar = recover(problem, idle)
+    np.testing.assert_allclose(K_bar[0], np.kron(np.eye(problem.n), problem.plant.A), atol=1e-12)
+    P = block_diagonal(idle.R, idle.Q)
+    gamma = 1.01 * least_gamma(error_model(problem, K_bar, H_bar).M, P)
+    verdict = check(problem, K_bar, H_bar, P=P, gamma=gamma)
+    assert verdict.holds
+    assert min(verdict.margins.values()) > 1e-3
+
+
+def broken(times: int, solver: Callable[..., conic.Answer]) -> Callable[..., conic.Answer]:
+    """A solver that stalls the first times it is called."""
+    calls = 0
+
+    def clarabel(cones: Any, q: Array) -> conic.Answer:
+        nonlocal calls
+        calls += 1
+        if calls > times:
+            return solver(cones, q)
+        record = Solver(name="CLARABEL", version="0", status="failed: NumericalError", iterations=3, seconds=0.0)
+        return conic.Answer(np.zeros(len(q)), record)
+
+    return clarabel
+
+
+@pytest.mark.parametrize(
+    ("times", "status", "name"),
+    [
+        (1, "optimal on rescaled data; CLARABEL failed: NumericalError", "CLARABEL"),
+        (2, "rescaled data; CLARABEL failed: NumericalError; CLARABEL on rescaled data failed: NumericalError", "SCS"),
+    ],
+)
+def test_what_failed_before_an_answer_stands_in_the_status(
+    times: int, status: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clarabel, Clarabel on rescaled data, SCS: the first answer is taken, and what failed before is said."""
+    problem = random_problem(11)
+    gamma = decomposed.solve(problem).gamma
+    monkeypatch.setattr(conic, "clarabel", broken(times, conic.clarabel))
+    solution = decomposed.solve(problem)
+    assert solution.solver.name == name
+    assert status in solution.solver.status
+    assert solution.gamma == pytest.approx(gamma, rel=1e-3)
+
+
+def test_a_solver_that_stalls_is_tried_again_on_rescaled_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An inaccurate answer is kept only where the rescaled data give none; either way both are said."""
+    problem, solved, calls = random_problem(11), conic.clarabel, 0
+
+    def clarabel(cones: Any, q: Array) -> conic.Answer:
+        nonlocal calls
+        calls += 1
+        u, record = solved(cones, q)
+        status = "optimal_inaccurate" if calls in (1, 3) else "optimal" if calls == 2 else "failed: NumericalError"
+        return conic.Answer(u, record.model_copy(update={"status": status}))
+
+    monkeypatch.setattr(conic, "clarabel", clarabel)
+    assert decomposed.solve(problem).solver.status == "optimal on rescaled data; CLARABEL optimal_inaccurate"
+    status = decomposed.solve(problem).solver.status
+    assert status == "optimal_inaccurate; CLARABEL on rescaled data failed: NumericalError"
+
+
+def test_no_answer_at_all_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unattainable lists every attempt."""
+    monkeypatch.setattr(conic, "clarabel", broken(2, conic.clarabel))
+    monkeypatch.setattr(conic, "installed", lambda solve: solve.__name__ == "clarabel")
+    with pytest.raises(Unattainable, match=r"NumericalError; CLARABEL on rescaled data failed: NumericalError\); try"):
+        decomposed.solve(find("two-nodes"))
+
+
+def test_infeasible_is_said_and_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solver that proves infeasibility ends the attempts with one sentence."""
+
+    def clarabel(cones: Any, q: Array) -> conic.Answer:
+        record = Solver(name="CLARABEL", version="0", status="infeasible", iterations=3, seconds=0.0)
+        return conic.Answer(np.zeros(len(q)), record)
+
+    monkeypatch.setattr(conic, "clarabel", clarabel)
+    with pytest.raises(Unattainable, match=r"infeasible for two-nodes.*check A.*try"):
+        decomposed.solve(find("two-nodes"))
+
+
+def test_clarabel_and_scs_call_an_infeasible_lmi_infeasible() -> None:
+    """u >= 1 and -u >= 0: both solvers' words are translated."""
+    build = Assembly()
+    u, one = build.unknown(1, 1), np.zeros(1, dtype=np.int64)
+    for factor, number in ((1.0, -1.0), (-1.0, 0.0)):
+        inequality = build.inequality()
+        inequality.append(1)
+        inequality.add(one, one, u, factor=factor)
+        inequality.add_number(one, one, np.array([[number]]))
+    for solver in (conic.clarabel, conic.scs):
+        assert solver(build.cones(), np.ones(1)).record.status == "infeasible"
+
+
+def test_twenty_five_nodes_are_designed_in_seconds_and_stored_small() -> None:
+    """4 modes: confirmed within 1e-4 of the optimum, in a gains file of less than 200 kB."""
+    gains = design(banded(25), method="decomposed")
+    assert gains.certificate.form == "structured"
+    assert gains.certificate.gamma == pytest.approx(gains.certificate.lmi_gamma, rel=1e-4)
+    assert len(gains.canonical()) < 200_000
+    assert gains.solver.status == "optimal"
+    assert gains.solver.version == clarabel.__version__

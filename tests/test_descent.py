@@ -1,0 +1,149 @@
+"""Gains designed for the exact gain: the barrier's gradient, the search, its interruption, and the file it ends in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from networks import random_gains, random_problem
+
+from agent.contract.arrays import Array
+from agent.contract.gains import Gains
+from designer import bfgs
+from designer.barrier import Barrier, Entries
+from designer.certificate import verify
+from designer.consensus import consensus_gains
+from designer.descent import Progress, descend
+from designer.error_model import error_model
+from designer.floor import floor
+from designer.gain import exact_gain
+from designer.problems import find
+from designer.synthesis import design
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_gradients_of_both_barriers_agree_with_differences(seed: int) -> None:
+    """By every direction of the gains and of y = log g."""
+    problem = random_problem(seed)
+    barrier = Barrier(problem, 9)
+    v = barrier.entries.pack(*random_gains(problem, seed, size=0.1))
+    y = math.log(2.0 * exact_gain(error_model(problem, *barrier.entries.unpack(v))).high ** 2)
+    rng = np.random.default_rng(0)
+    for function, x in ((barrier.descent(0.03), np.append(v, y)), (barrier.centre(y, 2.0), v)):
+        _, gradient = function(x)
+        for _ in range(3):
+            direction = 1e-5 * rng.normal(size=len(x))
+            difference = function(x + direction)[0] - function(x - direction)[0]
+            assert difference / 2.0 == pytest.approx(float(gradient @ direction), rel=1e-5, abs=1e-10)
+
+
+def test_the_barrier_is_finite_exactly_where_g_is_above_gamma_squared() -> None:
+    """Just above gamma_T^2 it is a number, just below it is infinite."""
+    problem = random_problem(3)
+    barrier = Barrier(problem, 200)
+    v = barrier.entries.pack(*random_gains(problem, 3, size=0.1))
+    gain = exact_gain(error_model(problem, *barrier.entries.unpack(v)))
+    J = barrier.descent(0.1)
+    assert math.isfinite(J(np.append(v, 2.0 * math.log(gain.high * (1.0 + 1e-6))))[0])
+    assert J(np.append(v, 2.0 * math.log(gain.low * (1.0 - 1e-6))))[0] == math.inf
+
+
+def test_entries_are_those_that_the_topologies_allow() -> None:
+    """Consensus gains keep to them, and packing loses nothing of them."""
+    problem = random_problem(4)
+    entries = Entries(problem)
+    K_bar, H_bar = consensus_gains(problem, weight=0.3)
+    v = entries.pack(K_bar, H_bar)
+    assert np.count_nonzero(v) == np.count_nonzero(K_bar) + np.count_nonzero(H_bar)
+    for stacked, back in zip((K_bar, H_bar), entries.unpack(v), strict=True):
+        np.testing.assert_array_equal(stacked, back)
+
+
+def test_consensus_gains_leave_the_estimates_unbiased() -> None:
+    """Every row of K_bar shares out A."""
+    problem = random_problem(5)
+    K_bar, _ = consensus_gains(problem, weight=0.3)
+    ones = np.tile(np.eye(problem.nx), (problem.n, 1))
+    np.testing.assert_allclose(K_bar @ ones, np.tile(problem.plant.A, (2, problem.n, 1)), atol=1e-14)
+
+
+def test_bfgs_finds_a_minimum_with_a_kink() -> None:
+    """Nesterov's nonsmooth variant of Rosenbrock's function, minimum 0 at (1, 1)."""
+
+    def kinked(x: Array) -> tuple[float, Array]:
+        inner = x[1] - 2.0 * x[0] ** 2 + 1.0
+        gradient = np.array([(x[0] - 1.0) / 2.0 - 4.0 * x[0] * np.sign(inner), np.sign(inner)])
+        return float((x[0] - 1.0) ** 2 / 4.0 + abs(inner)), gradient
+
+    point = bfgs.start(kinked, np.array([-1.0, 1.3]))
+    for _ in range(300):
+        following = bfgs.step(kinked, point)
+        if following is None:
+            break
+        point = following
+    assert point.value < 1e-5
+
+
+def test_any_start_leads_to_the_answer_that_is_known() -> None:
+    """two-nodes has the gain sqrt 2 at best; the chosen gains are within 0.1 % of the least found."""
+    problem = find("two-nodes")
+    starts = {str(seed): random_gains(problem, seed, size=0.1) for seed in range(2)}
+    found = descend(problem, starts)
+    assert math.sqrt(2.0) <= found.least.gain.high <= math.sqrt(2.0) * (1.0 + 1e-4)
+    assert found.chosen.gain.high <= found.least.gain.high * 1.00101
+    assert found.chosen.cost <= found.least.cost
+    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+
+
+@pytest.mark.parametrize(("name", "target"), [("zhu2020-ideal", 0.2700), ("zhu2020-lossy", 0.2456)])
+def test_the_papers_examples_reach_their_targets(name: str, target: float) -> None:
+    """From Kalman-consensus gains, without any solver."""
+    problem = find(name)
+    found = descend(problem, {"consensus": consensus_gains(problem, weight=0.4)})
+    assert found.chosen.gain.high <= target
+
+
+def test_an_interrupted_search_keeps_the_best_so_far() -> None:
+    """KeyboardInterrupt after some steps: gains no worse than what progress reported, and no exception."""
+    problem = find("zhu2020-lossy")
+    reported: list[Progress] = []
+
+    def interrupt(progress: Progress) -> None:
+        reported.append(progress)
+        if progress.steps == 25:
+            raise KeyboardInterrupt
+
+    found = descend(problem, {"consensus": consensus_gains(problem, weight=0.2)}, progress=interrupt)
+    assert found.interrupted
+    assert found.steps == 25
+    assert found.chosen.gain.stable
+    assert found.least.gain.high <= min(progress.gamma for progress in reported) * 1.01
+
+
+def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
+    """floor <= exact <= gamma, and the check confirms gamma for what a reader of the file has."""
+    problem = find("two-nodes")
+    gains = Gains.from_bytes(design(problem, method="exact").canonical(), source="memory")
+    proved = gains.certificate
+    assert (proved.kind, proved.form, gains.method) == ("exact", "full", "exact")
+    assert proved.holds
+    assert proved.exact is not None
+    assert proved.floor is not None
+    assert proved.P is not None
+    assert proved.horizon is not None
+    assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
+    assert verify(gains).holds
+    lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
+    verdict = verify(gains.model_copy(update={"certificate": lower}))
+    assert not verdict.holds
+    assert verdict.failure is not None
+
+
+def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
+    """floor <= exact gain of its gains <= its gamma."""
+    problem = find("two-nodes")
+    proved = design(problem, method="theorem2-reduced").certificate
+    assert proved.exact is not None
+    assert proved.floor == floor(problem)
+    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6)
