@@ -103,6 +103,10 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     if facts["holds"]:
         command = "verify" if facts["kind"] == "gains" else "replay"
         shown["gamma"] = f'claimed {facts["gamma"]:.6g}, by design; "peakmesh {command}" checks it'
+    if facts.get("exact"):
+        shown["exact"] = "claimed between {:.6g} and {:.6g}".format(*facts["exact"])
+    if facts.get("floor") is not None:
+        shown["floor"] = f"claimed {facts['floor']:.6g}"
     absent = {name for name in ("lmi_gamma", "exact", "floor") if facts.get(name) is None}
     return {name: value for name, value in shown.items() if name not in {"holds", "verified", *absent}}
 

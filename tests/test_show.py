@@ -58,6 +58,11 @@ def test_what_gains_claim_is_shown_as_a_claim(tmp_path: Path) -> None:
     text = show.text(facts)
     assert re.search('gamma +claimed 0.347992, by design; "peakmesh verify" checks it', text)
     assert not re.search("^(holds|verified|exact|floor)", text, re.MULTILINE)
+    document["certificate"] |= {"exact": [0.25, 0.5], "floor": 0.125}
+    Gains.model_validate(document).save(path, force=True)
+    text = show.text(show.describe(path))
+    assert re.search("exact +claimed between 0.25 and 0.5", text)
+    assert re.search("floor +claimed 0.125", text)
     assert 'claimed 0.347992, by design; "peakmesh replay" checks it' in show.text(show.describe(GOLDEN))
 
 
