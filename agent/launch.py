@@ -78,7 +78,7 @@ def launch(
         try:
             crew.raise_what_happened()
         except RunBroken as error:
-            kept = [path for path in (recording, recording.with_name(recording.name + ".part")) if path.exists()]
+            kept = [path for path in (recording.with_name(recording.name + ".part"), recording) if path.exists()]
             if crew.started and kept:
                 error.args = (f"{error}; what was recorded is in {kept[0]}",)
             raise
@@ -142,9 +142,10 @@ class _Crew:
                     continue
 
     def wait(self) -> None:
-        """Until all have ended, the recorder first; who lingers is killed."""
-        _wait_or_kill(self._children[RECORDER].process, RECORDER_SECONDS)
-        deadline = time.monotonic() + FAREWELL_SECONDS
+        """Until all have ended, the recorder first; who lingers is killed, at once where nothing was recorded yet."""
+        if self.started:
+            _wait_or_kill(self._children[RECORDER].process, RECORDER_SECONDS)
+        deadline = time.monotonic() + (FAREWELL_SECONDS if self.started else 0.0)
         for child in self._children.values():
             _wait_or_kill(child.process, deadline - time.monotonic())
 

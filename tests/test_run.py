@@ -190,6 +190,21 @@ def test_signal_ends_the_run_in_order(gains_path: Path, tmp_path: Path, number: 
     assert children(os.getpid()) == {}
 
 
+def test_signal_before_the_start_ends_the_run(gains_path: Path, tmp_path: Path) -> None:
+    """A run that is stopped while it gathers leaves nothing: no process, no file."""
+
+    def stop(word: dict[str, Any]) -> None:
+        if "listening" in word:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    started_at = time.monotonic()
+    with pytest.raises(Interrupted):
+        run_here(gains_path, tmp_path / "run.mcap", heed=stop)
+    assert time.monotonic() - started_at < 10.0  # below the time that a recorder at work would be given
+    assert children(os.getpid()) == {}
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_killed_node_ends_the_run(gains_path: Path, tmp_path: Path, gains: Gains) -> None:
     """Kill -9 of a node: exit 3, the node and its step named, a readable recording, no process left."""
     name = gains.problem.node_names[1]
