@@ -21,7 +21,6 @@ EXIT_NO = 1
 EXIT_INPUT = 2
 EXIT_BROKEN = 3
 EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
 
 
 class PeakmeshError(Exception):

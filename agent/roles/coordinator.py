@@ -93,11 +93,12 @@ class Conductor:
         self._bus.enter()
         for who in self._bus.meet([*self._everybody, *map(sensor_who, self._plan.external)]):
             self._report({"joined": who})
+        own = self._gains.digest()
         for who, ready in self._bus.gather(self._everybody).items():
-            if ready.gains != self._gains.digest():
+            if ready.gains != own:
                 raise InputError(
                     f"{in_words(who)} runs on other gains ({ready.gains[:12]}...) than the coordinator "
-                    f"({self._gains.digest()[:12]}...); give everybody the same gains file"
+                    f"({own[:12]}...); give everybody the same gains file"
                 )
         self._order("start")
         self._started = True

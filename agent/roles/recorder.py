@@ -66,7 +66,7 @@ class Recorder:
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._acknowledged = 0
         self._closing = False
-        self._last_write = time.monotonic()
+        self._quiet_since = time.monotonic()
 
     def record(self) -> None:
         """Until Bus.receive raises: the run is closed, the coordinator lost, or a signal came."""
@@ -77,7 +77,7 @@ class Recorder:
                 self._write(word)
             pause = SHORTEST_PAUSE if self._write_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             self._writer.flush_when_due()
-            if time.monotonic() - self._last_write >= IDLE_SECONDS:
+            if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
 
     def _write_waiting(self) -> bool:
@@ -95,8 +95,7 @@ class Recorder:
         """Ask everybody for what is missing, end the file, and let everybody go."""
         self._closing = True
         self._write_waiting()
-        for who in self._publishers:
-            self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
+        self._ask_everybody()
         for sample in self._bus.replayed(self._publishers):
             self._write(sample)
         self._write_waiting()  # what came meanwhile
@@ -122,14 +121,18 @@ class Recorder:
         now = time.time_ns()
         number, published = sample.stamp[:2] if sample.stamp is not None else (0, now)
         self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
-        self._last_write = time.monotonic()
+        self._quiet_since = time.monotonic()
 
     def _complain(self) -> None:
         """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
+        self._ask_everybody()
+        self._acknowledge(lacking=self._ledger.lacking())
+        self._quiet_since = time.monotonic()
+
+    def _ask_everybody(self) -> None:
+        """For the messages that we do not hold; they come as samples."""
         for who in self._publishers:
             self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
-        self._acknowledge(lacking=self._ledger.lacking())
-        self._last_write = time.monotonic()
 
     def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False) -> None:
         ledger = self._ledger
