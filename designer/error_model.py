@@ -152,11 +152,6 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     return ErrorModel(A, B, F, M, bar.beta, bar.alpha, problem.markov.transition, plant_states=nx)
 
 
-def error_model_of(gains: Gains) -> ErrorModel:
-    """The reduced error model of a gains file."""
-    return error_model(gains.problem, *stacked_gains(gains))
-
-
 def paper_error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     """Eqs. (10)(11) as printed: eta = [x_bar; e], of length 2 n nx."""
     bar, modes = stacks(problem), len(problem.topologies)
