@@ -18,6 +18,7 @@ from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.certificate import Verdict, check, least_gamma
 from designer.error_model import ErrorModel, error_model
+from designer.gain import Operator
 
 _ABOVE = 1.0 + 1e-9  # gamma stands this factor above the infimum of (18), so that (18) is strict
 _MOST_STEPS = 5000
@@ -92,14 +93,9 @@ def plant_lyapunov(model: ErrorModel, P: Array) -> Array | None:
 
 def corner(model: ErrorModel, P: Array) -> Array:
     """L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i for every mode s, (modes, n_eta, n_eta)."""
-    p, result = model.plant_states, []
-    for s in range(len(P)):
-        P_bar = np.tensordot(model.transition[s], P, axes=1)
-        L = model.A[s].T @ P_bar @ model.A[s]
-        for alpha_i, F_i in zip(model.alpha, model.F[s], strict=True):
-            L[:p, :p] += alpha_i * (F_i.T @ P_bar[p:, p:] @ F_i)
-        result.append((L + L.T) / 2.0)
-    return np.array(result)
+    operator = Operator(model)
+    L = operator.corner(P)
+    return (L + L.swapaxes(1, 2)) / 2.0
 
 
 def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:

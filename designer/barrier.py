@@ -16,7 +16,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer import bfgs
-from designer.error_model import error_model, measurement_slices, rows_total
+from designer.error_model import ErrorModel, error_model, measurement_slices, rows_total
 from designer.gain import Operator
 from designer.sensitivity import Inputs, slope, sweep
 
@@ -24,9 +24,13 @@ StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes
 
 
 class Entries:
-    """The entries of K_bar and H_bar that the topologies allow, as one vector."""
+    """The entries of K_bar and H_bar that the topologies allow, as one vector.
+
+    Where gains are unbiased, K_ii is not free: a_ii K_ii = A - sum over j != i of a_ij K_ij.
+    """
 
     def __init__(self, problem: Problem) -> None:
+        self.problem = problem
         nx, columns, modes = problem.nx, measurement_slices(problem), len(problem.topologies)
         self.K = np.zeros((modes, problem.n * nx, problem.n * nx), dtype=bool)
         self.H = np.zeros((modes, problem.n * nx, rows_total(problem)), dtype=bool)
@@ -34,19 +38,36 @@ class Entries:
             for i in range(problem.n):
                 rows = slice(i * nx, (i + 1) * nx)
                 for j in problem.neighbours(s, i):
-                    self.K[s, rows, j * nx : (j + 1) * nx] = True
+                    self.K[s, rows, j * nx : (j + 1) * nx] = not problem.unbiased or j != i
                     self.H[s, rows, columns[j]] = True
 
     def pack(self, K_bar: Array, H_bar: Array) -> Array:
         """All K entries, then all H entries."""
         return np.concatenate([K_bar[self.K], H_bar[self.H]])
 
+    def pack_slope(self, K_bar: Array, H_bar: Array) -> Array:
+        """The derivative by the vector, from those by K_bar and H_bar."""
+        if self.problem.unbiased:
+            K_bar = K_bar - np.tile(self._own(K_bar), (1, 1, self.problem.n))
+        return self.pack(K_bar, H_bar)
+
     def unpack(self, v: Array) -> StackedGains:
         """The inverse of `pack`, zero elsewhere."""
         K_bar, H_bar = np.zeros(self.K.shape), np.zeros(self.H.shape)
         split = np.count_nonzero(self.K)
         K_bar[self.K], H_bar[self.H] = v[:split], v[split:]
+        if self.problem.unbiased:
+            n, nx = self.problem.n, self.problem.nx
+            own = np.tile(self.problem.plant.A, (n, 1)) - K_bar.reshape(-1, n * nx, n, nx).sum(axis=2)
+            for i in range(n):
+                rows = slice(i * nx, (i + 1) * nx)
+                K_bar[:, rows, rows] = own[:, rows]
         return K_bar, H_bar
+
+    def _own(self, K_bar: Array) -> Array:
+        """The blocks (i, i), one below the other, (modes, n nx, nx)."""
+        n, nx = self.problem.n, self.problem.nx
+        return np.concatenate([K_bar[:, i * nx : (i + 1) * nx, i * nx : (i + 1) * nx] for i in range(n)], axis=1)
 
 
 class Barrier:
@@ -56,9 +77,13 @@ class Barrier:
         self.problem, self.horizon = problem, horizon
         self.entries, self.inputs = Entries(problem), Inputs(problem)
 
-    def operator(self, v: Array) -> Operator:
+    def model(self, v: Array) -> ErrorModel:
         """The error model of the gains v."""
-        return Operator(error_model(self.problem, *self.entries.unpack(v)))
+        return error_model(self.problem, *self.entries.unpack(v))
+
+    def operator(self, v: Array) -> Operator:
+        """The same, in the shapes of the recursions."""
+        return Operator(self.model(v))
 
     def descent(self, mu: float) -> bfgs.Function:
         """J(v, y), whose minimum goes to that of log gamma_T^2 as mu goes to 0."""
@@ -89,12 +114,13 @@ class Barrier:
         v, y = x[:-1], float(x[-1])
         swept = None
         if abs(y) < 300.0 and np.abs(v).max() < 1e50:  # beyond, squares overflow
-            operator, g = self.operator(v), math.exp(y)
+            model, g = self.model(v), math.exp(y)
+            operator = Operator(model)
             swept = sweep(operator, g, self.horizon)
         if swept is None:
             return -math.inf, np.zeros_like(x)
-        slopes = slope(operator, self.inputs, swept, swept.W_inverse)
+        slopes = slope(model, operator, self.inputs, swept, swept.W_inverse)
         traces = float(np.trace(swept.W_inverse, axis1=2, axis2=3).sum())
         count = swept.Gamma.shape[0] * swept.Gamma.shape[1] * operator.nw
-        down = self.entries.pack(slopes.K_bar, slopes.H_bar)
+        down = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
         return swept.log_det, np.append(-down, g * (traces - slopes.g) - count)

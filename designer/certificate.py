@@ -12,6 +12,7 @@ is at most (m + 1) u trace away from a positive semidefinite one).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,8 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, listed
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.error_model import ErrorModel, error_model, measurement_slices, stacked_gains, stacks
+from designer.error_model import ErrorModel, error_model, stacked_gains, stacks
+from designer.gain import Operator
 
 ARITHMETIC = "float64, Cholesky with an a-priori allowance for rounding"
 _U = 2.0**-53
@@ -70,15 +72,17 @@ def check(problem: Problem, K_bar: Array, H_bar: Array, *, P: Array, gamma: floa
 def lyapunov_matrix(gains: Gains) -> Array:
     """P(s) over eta = [x; e_1; ...; e_n] from the stored certificate, (modes, n_eta, n_eta)."""
     problem, certificate = gains.problem, gains.certificate
-    nx, n_eta = problem.nx, problem.nx * (problem.n + 1)
+    nx, p = problem.nx, problem.nx if problem.carries_plant else 0
+    n_eta = p + problem.n * nx
     P = np.zeros((len(problem.mode_names), n_eta, n_eta))
     for s, mode in enumerate(problem.mode_names):
         if certificate.form == "full":
             P[s] = _stored(certificate.P or {}, mode, f"P of mode {mode}", n_eta)
             continue
-        P[s, :nx, :nx] = _stored({"R": certificate.R} if certificate.R is not None else {}, "R", "R", nx)
-        for i, node in enumerate(problem.node_names, 1):
-            part = slice(i * nx, (i + 1) * nx)
+        if p:
+            P[s, :nx, :nx] = _stored({"R": certificate.R} if certificate.R is not None else {}, "R", "R", nx)
+        for i, node in enumerate(problem.node_names):
+            part = slice(p + i * nx, p + (i + 1) * nx)
             P[s, part, part] = _stored((certificate.Q or {}).get(mode, {}), node, f"Q of mode {mode}", nx)
     return P
 
@@ -90,15 +94,10 @@ def least_gamma(M: Array, P: Array) -> float:
 
 def inequality_17(model: ErrorModel, s: int, P: Array, *, sign: float = -1.0) -> Array:
     """Minus the matrix of (17) for mode s, (n_eta + nw, n_eta + nw); sign = +1 adds where (17) subtracts."""
-    A, B, F, p = model.A[s], model.B[s], model.F[s], model.plant_states
-    weights = model.transition[s] / model.transition[s].sum()  # a row may miss 1 by rounding
-    P_bar = np.tensordot(weights, P, axes=1)
-    PA, PB = P_bar @ A, P_bar @ B
-    S_11 = P[s] + sign * (A.T @ PA)
-    for alpha_i, F_i in zip(model.alpha, F, strict=True):
-        if alpha_i > 0.0:
-            S_11[:p, :p] += sign * alpha_i * (F_i.T @ P_bar[p:, p:] @ F_i)
-    S = np.block([[S_11, sign * (A.T @ PB)], [sign * (B.T @ PA), np.eye(B.shape[1]) + sign * (B.T @ PB)]])
+    operator = Operator(model)
+    S = sign * operator.joint(operator.bar(P))[s]
+    S[: model.size, : model.size] += P[s]
+    S[model.size :, model.size :] += np.eye(model.nw)
     return np.asarray((S + S.T) / 2.0)
 
 
@@ -110,16 +109,23 @@ def inequality_18(model: ErrorModel, s: int, P: Array, gamma: float, *, sign: fl
 def _magnitudes(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     """An error model of the sums of absolute values: what rounding errors in the model's entries are relative to."""
     bar, nx = stacks(problem), problem.nx
-    ones = np.tile(np.eye(nx), (problem.n, 1))
-    K, H = np.abs(K_bar), np.abs(H_bar)
     model = error_model(problem, K_bar, H_bar)
+    p, K, H, n = model.plant_states, np.abs(K_bar), np.abs(model.H), problem.n
     A, B = np.abs(model.A), np.abs(model.B)
-    A[:, nx:, :nx] = (np.abs(bar.A) + K) @ ones
-    A[:, nx:, nx:] = K + H @ np.abs(bar.C_beta)
-    B[:, nx:] = np.abs(bar.B) + H @ np.abs(bar.D)
-    measured = zip(measurement_slices(problem), problem.nodes, strict=True)
-    F = np.stack([H[:, :, rows] @ np.abs(node.C) for rows, node in measured], axis=1)
-    return ErrorModel(A, B, F, np.abs(model.M), model.beta, model.alpha, model.transition, nx)
+    ones = np.tile(np.eye(nx), (n, 1))
+    if p:
+        A[:, p:, :p] = (np.abs(bar.A) + K) @ ones
+    A[:, p:, p:] = K + H @ np.abs(bar.C_beta)
+    for i in range(n):
+        rows = slice(i * nx, (i + 1) * nx)
+        A[:, p:, p:][:, rows, rows] += (K @ ones)[:, rows]
+    B[:, p:] = np.abs(bar.B) + H @ np.abs(bar.D_beta)
+    links = model.links
+    if links is not None:
+        V = 2.0 * np.abs(links.V)  # columns of e_j are differences
+        V += np.abs(V).max()
+        links = replace(links, V=V)
+    return replace(model, A=A, B=B, H=H, R=np.abs(model.R), M=np.abs(model.M), links=links)
 
 
 def _allowance(magnitude: Array, problem: Problem) -> Array:

@@ -1,11 +1,12 @@
-"""The paper's centralised error model, eqs. (6)-(11), for every mode; and the same with the shorter state.
+"""The centralised error model: eqs. (6)-(11) of the paper for every mode, with what real networks need beside it.
 
 Eq. (10) has the state [1 kron x; e], but 1 kron x never leaves an nx-dimensional subspace. The reduced model has
-eta = [x; e_1; ...; e_n], of length nx (n + 1); it gives the same errors. `error_model` is the reduced one, and
-is used everywhere; `paper_error_model` is (10)(11) as printed.
+eta = [x; e_1; ...; e_n]; it gives the same errors. Where gains are unbiased and every loss is seen, x drops out and
+eta = [e_1; ...; e_n]. `error_model` is the reduced one, and is used everywhere; `paper_error_model` is (10)(11) as
+printed.
 
-F_i is zero except for one block (rows of e, columns of x), and only that block is kept: for 100 nodes with four
-states it is 5 MB for four modes, where the matrices as printed would take gigabytes.
+Chance enters in three ways, each with mean 0 and uncorrelated with the others (docs/theory.md derives it):
+theta_j - beta_j for every node, phi_ij - rho_ij for every lossy link, and the products of both.
 """
 
 from __future__ import annotations
@@ -15,33 +16,86 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class LinkTerms:
+    """What lossy links do to the errors: xi_l V_l [eta; w] is added to e of one node, for every l, in one mode.
+
+    xi_l is phi_ij - rho_ij, or (phi_ij - rho_ij)(theta_j - beta_j) where `with_loss`. Only some columns of V_l are
+    not zero, and those are kept.
+    """
+
+    mode: Indices  # (terms,)
+    receiver: Indices  # (terms,): i
+    sender: Indices  # (terms,): j
+    with_loss: NDArray[np.bool_]  # (terms,)
+    rho: Array  # (terms,): rho_ij
+    variance: Array  # (terms,): of xi_l
+    columns: Indices  # (terms, c): of [eta; w]; those of (x, e_i, e_j, w)
+    V: Array  # (terms, nx, c)
+
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Eq. (10): eta(k+1) = [A_s + sum_i (theta_i - beta_i) F_i,s] eta + B_s w, z_tilde = M eta, in mode s.
+    """Eq. (10): eta(k+1) = [A_s + sum_i (theta_i - beta_i) F_i,s] eta + B_s w(k), z_tilde = M eta, in mode s.
 
-    `plant_states` is the length p of the part of eta that comes before e: nx, or n nx in the printed form.
+    `plant_states` is the length p of the part of eta that comes before e: nx, n nx in the printed form, or 0.
+    F_i = -H[:, rows_i] R[rows_i] in the rows of e, where rows_i are the measurements of node i; it acts on [eta; w],
+    since a loss that is seen takes D_i w with it.
     """
 
     A: Array  # (modes, n_eta, n_eta), script A of (11)
     B: Array  # (modes, n_eta, nw), script B
-    F: Array  # (modes, n, n nx, p): the rows of e and the columns of the plant's part of script F_i
+    H: Array  # (modes, n nx, sum ny): H_bar, each block times rho_ij
+    R: Array  # (sum ny, n_eta + nw): what a loss takes from each innovation
     M: Array  # (n nz, n_eta), script M
     beta: Array  # (n,)
     alpha: Array  # (n,): beta (1 - beta)
     transition: Array  # (modes, modes): Pi
     plant_states: int
+    rows: list[slice]  # of each node's measurements
+    links: LinkTerms | None  # None: no link loses messages
+
+    @property
+    def modes(self) -> int:
+        return len(self.A)
+
+    @property
+    def size(self) -> int:
+        """n_eta."""
+        return int(self.A.shape[1])
+
+    @property
+    def nw(self) -> int:
+        return int(self.B.shape[2])
+
+    @cached_property
+    def owner(self) -> Indices:
+        """The node of each measurement, (sum ny,)."""
+        return np.repeat(np.arange(len(self.rows)), [rows.stop - rows.start for rows in self.rows])
 
     def F_i(self, s: int, i: int) -> Array:
-        """Script F_i of (11) in full, (n_eta, n_eta)."""
-        full = np.zeros_like(self.A[s])
-        full[self.plant_states :, : self.plant_states] = self.F[s, i]
-        return np.asarray(full)
+        """Script F_i in full, with the columns of w: (n_eta, n_eta + nw)."""
+        full = np.zeros((self.size, self.size + self.nw))
+        full[self.plant_states :] = -self.H[s][:, self.rows[i]] @ self.R[self.rows[i]]
+        return full
+
+    def V_l(self, term: int) -> Array:
+        """The matrix of one term of the links in full, (n_eta, n_eta + nw)."""
+        assert self.links is not None
+        nx = self.links.V.shape[1]
+        full = np.zeros((self.size, self.size + self.nw))
+        first = self.plant_states + int(self.links.receiver[term]) * nx
+        full[first : first + nx, self.links.columns[term]] = self.links.V[term]
+        return full
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +107,7 @@ class Stacks:
     C: Array  # (sum ny, n nx): diag{C_1, ..., C_n}
     C_beta: Array  # (sum ny, n nx): C_bar_beta
     D: Array  # (sum ny, nw): D_bar
+    D_beta: Array  # (sum ny, nw): beta_i D_i where node i sees its losses, else D_i: the mean of what arrives of D w
     M: Array  # (n nz, n nx): M_bar
     beta: Array  # (n,)
     alpha: Array  # (n,), eq. (3)
@@ -72,15 +127,20 @@ def stacks(problem: Problem) -> Stacks:
     plant, n, beta, nx = problem.plant, problem.n, problem.beta, problem.nx
     slices = measurement_slices(problem)
     C, C_beta = np.zeros((2, slices[-1].stop, n * nx))
-    for i, rows in enumerate(slices):
-        C[rows, i * nx : (i + 1) * nx] = problem.nodes[i].C
+    D = np.vstack([node.D for node in problem.nodes])
+    D_beta = D.copy()
+    for i, (node, rows) in enumerate(zip(problem.nodes, slices, strict=True)):
+        C[rows, i * nx : (i + 1) * nx] = node.C
         C_beta[rows] = beta[i] * C[rows]
+        if node.seen:
+            D_beta[rows] = beta[i] * D[rows]
     return Stacks(
         A=np.asarray(np.kron(np.eye(n), plant.A), dtype=np.float64),
         B=np.tile(plant.B, (n, 1)),
         C=C,
         C_beta=C_beta,
-        D=np.vstack([node.D for node in problem.nodes]),
+        D=D,
+        D_beta=D_beta,
         M=np.asarray(np.kron(np.eye(n), plant.M), dtype=np.float64),
         beta=beta,
         alpha=beta * (1.0 - beta),
@@ -137,23 +197,103 @@ def link_gains(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[LinkMatric
 
 
 def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
-    """Eqs. (10)(11) with the reduced state eta = [x; e_1; ...; e_n]."""
+    """Eqs. (10)(11) with the reduced state: eta = [x; e_1; ...; e_n], or e alone where x drops out."""
     bar, plant, modes = stacks(problem), problem.plant, len(problem.topologies)
-    nx, n = problem.nx, problem.n
-    ones = np.tile(np.eye(nx), (n, 1))  # (n nx, nx): 1 kron I
-    C_one = bar.C @ ones  # (sum ny, nx): [C_1; ...; C_n]
-    A = np.zeros((modes, nx * (n + 1), nx * (n + 1)))
-    A[:, :nx, :nx] = plant.A
-    A[:, nx:, :nx] = bar.A @ ones - K_bar @ ones
-    A[:, nx:, nx:] = K_bar - H_bar @ bar.C_beta
-    B = np.concatenate([np.tile(plant.B, (modes, 1, 1)), bar.B - H_bar @ bar.D], axis=1)
-    F = np.stack([-H_bar[:, :, rows] @ C_one[rows] for rows in measurement_slices(problem)], axis=1)
-    M = np.hstack([np.zeros((n * problem.nz, nx)), bar.M])
-    return ErrorModel(A, B, F, M, bar.beta, bar.alpha, problem.markov.transition, plant_states=nx)
+    nx, n, p = problem.nx, problem.n, problem.nx if problem.carries_plant else 0
+    rho = problem.delivery
+    delivered = np.kron(rho, np.ones((nx, nx)))  # (n nx, n nx)
+    H = H_bar * np.repeat(np.repeat(rho, nx, axis=0), [len(node.C) for node in problem.nodes], axis=1)
+    A = np.zeros((modes, p + n * nx, p + n * nx))
+    B = np.zeros((modes, p + n * nx, problem.nw))
+    A[:, p:, p:] = delivered * K_bar - H @ bar.C_beta
+    undelivered = ((1.0 - delivered) * K_bar).reshape(modes, n, nx, n, nx).sum(axis=3)  # what node i makes up for
+    for i in range(n):
+        part = slice(p + i * nx, p + (i + 1) * nx)
+        A[:, part, part] += undelivered[:, i]
+    B[:, p:] = bar.B - H @ bar.D_beta
+    if p:
+        A[:, :p, :p], B[:, :p] = plant.A, plant.B
+    if not problem.unbiased:
+        ones = np.tile(np.eye(nx), (n, 1))  # (n nx, nx): 1 kron I
+        A[:, p:, :p] = bar.A @ ones - K_bar @ ones
+    R = _taken_by_losses(problem, bar, p)
+    M = np.hstack([np.zeros((n * problem.nz, p)), bar.M])
+    return ErrorModel(
+        A=A,
+        B=B,
+        H=H,
+        R=R,
+        M=M,
+        beta=bar.beta,
+        alpha=bar.alpha,
+        transition=problem.markov.transition,
+        plant_states=p,
+        rows=bar.rows,
+        links=_link_terms(problem, bar, K_bar, H_bar, R, p),
+    )
+
+
+def _taken_by_losses(problem: Problem, bar: Stacks, p: int) -> Array:
+    """What a loss takes from each innovation, (sum ny, n_eta + nw): C_i x, or where it is seen C_i e_i + D_i w."""
+    nx, size = problem.nx, p + problem.n * problem.nx
+    R = np.zeros((len(bar.D), size + problem.nw))
+    for i, (node, rows) in enumerate(zip(problem.nodes, bar.rows, strict=True)):
+        if node.seen or not p:
+            R[rows, p + i * nx : p + (i + 1) * nx] = node.C
+            R[rows, size:] = node.D
+        else:
+            R[rows, :p] = node.C
+    return R
+
+
+def _link_terms(problem: Problem, bar: Stacks, K_bar: Array, H_bar: Array, R: Array, p: int) -> LinkTerms | None:
+    """phi_ij - rho_ij multiplies a_ij (K_ij (e_j - e_i) - H_ij times the mean innovation of node j) in e_i.
+
+    Its product with theta_j - beta_j multiplies -a_ij H_ij times what a loss takes from the innovation.
+    """
+    nx, n, size = problem.nx, problem.n, p + problem.n * problem.nx
+    at_w = np.arange(size, size + problem.nw)
+    found = [
+        (s, i, j, with_loss)
+        for s in range(len(problem.topologies))
+        for i in range(n)
+        for j in problem.neighbours(s, i)
+        if problem.delivery[i, j] < 1.0
+        for with_loss in ((False, True) if bar.alpha[j] > 0.0 else (False,))
+    ]
+    if not found:
+        return None
+    columns, V = [], []
+    for s, i, j, with_loss in found:
+        at_i, at_j = (np.arange(p + node * nx, p + (node + 1) * nx) for node in (i, j))
+        here = np.concatenate([np.arange(p), at_i, at_j, at_w])
+        K_ij = K_bar[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx]
+        H_ij = H_bar[s, i * nx : (i + 1) * nx, bar.rows[j]]
+        if with_loss:
+            term = -H_ij @ R[bar.rows[j]][:, here]
+        else:
+            C_j = bar.C_beta[bar.rows[j], j * nx : (j + 1) * nx]
+            term = np.hstack([np.zeros((nx, p)), -K_ij, K_ij - H_ij @ C_j, -H_ij @ bar.D_beta[bar.rows[j]]])
+        columns.append(here)
+        V.append(term)
+    mode, receiver, sender, lost_too = (np.array(part) for part in zip(*found, strict=True))
+    rho = problem.delivery[receiver, sender]
+    return LinkTerms(
+        mode=mode,
+        receiver=receiver,
+        sender=sender,
+        with_loss=lost_too.astype(np.bool_),
+        rho=rho,
+        variance=rho * (1.0 - rho) * np.where(lost_too, bar.alpha[sender], 1.0),
+        columns=np.array(columns),
+        V=np.array(V),
+    )
 
 
 def paper_error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
-    """Eqs. (10)(11) as printed: eta = [x_bar; e], of length 2 n nx."""
+    """Eqs. (10)(11) as printed: eta = [x_bar; e], of length 2 n nx. The paper knows hidden losses alone."""
+    if problem.unbiased or problem.links or any(node.seen for node in problem.nodes):
+        raise ValueError("the paper's model has neither seen losses, nor lossy links, nor imposed unbiasedness")
     bar, modes = stacks(problem), len(problem.topologies)
     size = problem.n * problem.nx
     A = np.zeros((modes, 2 * size, 2 * size))
@@ -161,14 +301,36 @@ def paper_error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorMode
     A[:, size:, :size] = bar.A - K_bar
     A[:, size:, size:] = K_bar - H_bar @ bar.C_beta
     B = np.concatenate([np.tile(bar.B, (modes, 1, 1)), bar.B - H_bar @ bar.D], axis=1)
-    F = np.stack([-H_bar @ E_i for E_i in bar.E], axis=1)
+    R = np.hstack([bar.C, np.zeros((len(bar.C), size + problem.nw))])  # E_n^i in the rows of node i
     M = np.hstack([np.zeros_like(bar.M), bar.M])
-    return ErrorModel(A, B, F, M, bar.beta, bar.alpha, problem.markov.transition, plant_states=size)
+    transition = problem.markov.transition
+    return ErrorModel(A, B, H_bar, R, M, bar.beta, bar.alpha, transition, plant_states=size, rows=bar.rows, links=None)
 
 
-def step(model: ErrorModel, s: int, theta: Array, eta: Array, w: Array) -> Array:
-    """Eq. (10) for one step in mode s: eta(k+1), (n_eta,), from the realised theta (n,), eta (n_eta,), w (nw,)."""
-    p = model.plant_states
-    eta_next = model.A[s] @ eta + model.B[s] @ w
-    eta_next[p:] += np.tensordot(theta - model.beta, model.F[s], axes=1) @ eta[:p]
-    return np.asarray(eta_next)
+def realised(model: ErrorModel, s: int, theta: Array, delivered: NDArray[np.bool_] | None = None) -> Array:
+    """[A_k B_k], (n_eta, n_eta + nw): what (10) is in a step of mode s with these losses.
+
+    theta (n,) says which measurements arrived; delivered (n, n) which messages, row i for what node i got, and
+    counts where links are lossy.
+    """
+    AB = np.hstack([model.A[s], model.B[s]])
+    AB[model.plant_states :] -= (model.H[s] * (theta - model.beta)[model.owner]) @ model.R
+    links = model.links
+    if links is not None:
+        assert delivered is not None
+        nx = links.V.shape[1]
+        for term in np.flatnonzero(links.mode == s):
+            i, j = links.receiver[term], links.sender[term]
+            xi = delivered[i, j] - links.rho[term]
+            if links.with_loss[term]:
+                xi *= theta[j] - model.beta[j]
+            first = model.plant_states + i * nx
+            AB[first : first + nx, links.columns[term]] += xi * links.V[term]
+    return AB
+
+
+def step(
+    model: ErrorModel, s: int, theta: Array, eta: Array, w: Array, delivered: NDArray[np.bool_] | None = None
+) -> Array:
+    """Eq. (10) for one step in mode s: eta(k+1), (n_eta,), from what arrived, eta (n_eta,) and w (nw,)."""
+    return np.asarray(realised(model, s, theta, delivered) @ np.concatenate([eta, w]))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.error_model import ErrorModel
+from designer.error_model import ErrorModel, LinkTerms
 
 _WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
 _TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
@@ -45,17 +45,22 @@ class Operator:
     """The matrices of (10)(11) in the shapes that the recursions multiply by."""
 
     def __init__(self, model: ErrorModel) -> None:
-        modes, size, p = len(model.A), model.A.shape[1], model.plant_states
+        modes, size, p = model.modes, model.size, model.plant_states
         self.AB = np.concatenate([model.A, model.B], axis=2)  # (modes, n_eta, n_eta + nw)
         self.AB_T = np.ascontiguousarray(self.AB.swapaxes(1, 2))
-        self.lossy = np.flatnonzero(model.alpha > 0.0)
-        scaled = np.sqrt(model.alpha[self.lossy])[:, None, None] * model.F[:, self.lossy]  # (modes, lossy, n nx, p)
-        self.F = np.ascontiguousarray(scaled.transpose(0, 2, 1, 3)).reshape(modes, size - p, -1)  # [sqrt(alpha_i) F_i]
-        self.F_T = self.F.reshape(modes, -1, p).swapaxes(1, 2)
+        lossy = np.flatnonzero(model.alpha[model.owner] > 0.0)  # measurements that may be lost
+        owner, roots = model.owner[lossy], np.sqrt(model.alpha[model.owner[lossy]])
+        self.lossy = lossy
+        self.H = model.H[:, :, lossy] * roots  # sqrt(alpha_i) H of them, (modes, n nx, lossy)
+        self.H_T = np.ascontiguousarray(self.H.swapaxes(1, 2))
+        self.same = (owner[:, None] == owner).astype(np.float64)  # 1 where two measurements are lost together
+        self.R = model.R[lossy]
+        self.R_T = np.ascontiguousarray(self.R.T)
+        self.links = None if model.links is None else _Links(model.links, modes, size + model.nw, p)
         self.MM = np.broadcast_to(model.M.T @ model.M, (modes, size, size))
         self.M = model.M
         self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
-        self.p, self.size, self.nw = p, size, model.B.shape[2]
+        self.p, self.size, self.nw = p, size, model.nw
         self.eye_w = np.eye(self.nw)
 
     def bar(self, Y: Array) -> Array:
@@ -63,11 +68,16 @@ class Operator:
         return np.asarray((self.transition @ Y.reshape(len(Y), -1)).reshape(Y.shape))
 
     def joint(self, Y_bar: Array) -> Array:
-        """[A B]'Y_bar[A B], its upper left corner with the sum of alpha_i F_i'Y_bar F_i: what E|eta(k+1)|^2 weighs."""
+        """[A B]'Y_bar[A B] with the sum of alpha_i F_i'Y_bar F_i, and as much of links: what E|eta(k+1)|^2 weighs.
+
+        (modes, n_eta + nw, n_eta + nw). With F_i = -H_i R_i that sum is R'(H'Y_bar H, its blocks of each node)R.
+        """
         S = self.AB_T @ (Y_bar @ self.AB)
         if len(self.lossy):
-            YF = Y_bar[:, self.p :, self.p :] @ self.F
-            S[:, : self.p, : self.p] += self.F_T @ YF.reshape(len(YF), -1, self.p)
+            G = (self.H_T @ (Y_bar[:, self.p :, self.p :] @ self.H)) * self.same
+            S += self.R_T @ (G @ self.R)
+        if self.links is not None:
+            self.links.add(S, Y_bar)
         return np.asarray(S)
 
     def corner(self, Y: Array) -> Array:
@@ -75,12 +85,35 @@ class Operator:
         return self.joint(self.bar(Y))[:, : self.size, : self.size]
 
 
-class Sweep(NamedTuple):
-    """The recursion at g, from the end of the horizon backwards; row 0 is the last step. Rows of modes."""
+class _Links:
+    """What lossy links add to `Operator.joint`: V_l'Y_bar V_l for every term, at its columns."""
 
-    Y_bar: Array  # (T, modes, n_eta, n_eta)
-    W: Array  # (T, modes, nw, nw): g I - B'Y_bar B
-    Gamma: Array  # (T, modes, nw, n_eta): worst w = Gamma eta
+    def __init__(self, links: LinkTerms, modes: int, order: int, p: int) -> None:
+        nx = links.V.shape[1]
+        self.roots = np.sqrt(links.variance)[:, None, None]
+        self.V = self.roots * links.V
+        self.V_T = np.ascontiguousarray(self.V.swapaxes(1, 2))
+        rows = p + links.receiver[:, None] * nx + np.arange(nx)  # (terms, nx)
+        self.block = links.mode[:, None, None], rows[:, :, None], rows[:, None, :]
+        self.columns = links.mode[:, None, None], links.columns[:, :, None], links.columns[:, None, :]
+        at = (links.mode[:, None, None] * order + links.columns[:, :, None]) * order + links.columns[:, None, :]
+        self.at = at.reshape(-1)  # where the entries of all terms go
+
+    def add(self, S: Array, Y_bar: Array) -> None:
+        """In place."""
+        terms = self.V_T @ (Y_bar[self.block] @ self.V)  # (terms, c, c)
+        S += np.bincount(self.at, weights=terms.reshape(-1), minlength=S.size).reshape(S.shape)
+
+    def carry(self, X: Array, joint: Array) -> None:
+        """Add V_l cov V_l' to the covariance X of eta one step later, in place; joint is that of [eta; w]."""
+        np.add.at(X, self.block, self.V @ (joint[self.columns] @ self.V_T))
+
+    def by_V(self, Y_bar: Array, joint: Array) -> Array:
+        """Derivative of sum tr(V_l'Y_bar V_l cov) by every V_l, summed over the steps, (terms, nx, c)."""
+        steps = zip(Y_bar, joint, strict=True)
+        return np.asarray(
+            2.0 * self.roots * sum(Y_k[self.block] @ (self.V @ joint_k[self.columns]) for Y_k, joint_k in steps)
+        )
 
 
 def horizon_holds(operator: Operator, g: float, horizon: int) -> tuple[bool, float]:

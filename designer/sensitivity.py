@@ -14,7 +14,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.error_model import error_model, stacks
+from designer.error_model import ErrorModel, LinkTerms, error_model, stacks
 from designer.gain import Operator, horizon_gain, horizon_holds
 
 
@@ -57,24 +57,51 @@ class Slope(NamedTuple):
 
 
 class Inputs:
-    """What the gains multiply: K_bar in_K and H_bar in_H are their parts of the rows of e in [A B], by (6)-(11)."""
+    """What the gains multiply in (6)-(11), so that a derivative by the error model becomes one by the gains."""
 
     def __init__(self, problem: Problem) -> None:
         bar, nx = stacks(problem), problem.nx
-        ones = np.tile(np.eye(nx), (problem.n, 1))
-        zeros = np.zeros((len(bar.D), nx))
-        self.in_K_T = np.hstack([-ones, np.eye(len(ones)), np.zeros((len(ones), problem.nw))]).T
-        self.in_H_T = np.hstack([zeros, -bar.C_beta, -bar.D]).T
-        lossy = np.flatnonzero(bar.alpha > 0.0)
-        E = [bar.E[i] @ ones for i in lossy]  # (sum ny, nx): C_i in the rows of node i
-        roots = np.sqrt(bar.alpha[lossy])
-        self.lossy = -np.array([root * E_i.T for root, E_i in zip(roots, E, strict=True)]) if E else None
+        self.problem, self.bar, self.rho = problem, bar, problem.delivery
+        self.p = nx if problem.carries_plant else 0
+        self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
+        widths = [len(node.C) for node in problem.nodes]
+        self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)
+
+    def gains(self, model: ErrorModel, AB: Array, lossy: Array, V: Array | None) -> tuple[Array, Array]:
+        """Derivatives by K_bar and H_bar, from those by the rows of e in [A B], by H of `lossy` and by V of the links.
+
+        K_ij stands in columns x, e_j (times rho_ij) and e_i (times 1 - rho_ij); H_ij in those of e_j and w.
+        """
+        p, n, nx, bar = self.p, self.problem.n, self.problem.nx, self.bar
+        modes, x, e, w = len(AB), AB[:, :, :p], AB[:, :, p : p + n * nx], AB[:, :, p + n * nx :]
+        own = np.stack([e[:, i * nx : (i + 1) * nx, i * nx : (i + 1) * nx] for i in range(n)], axis=1)
+        every = np.tile(own.reshape(modes, n * nx, nx), (1, 1, n))
+        K = self.rho_K * e + (1.0 - self.rho_K) * every
+        if not self.problem.unbiased:
+            K -= np.tile(x, (1, 1, n))
+        H = lossy - e @ bar.C_beta.T - w @ bar.D_beta.T
+        H *= self.rho_H
+        if V is not None and model.links is not None:
+            self._add_links(model.links, model.R, V, K, H)
+        return np.asarray(K), np.asarray(H)
+
+    def _add_links(self, links: LinkTerms, R: Array, V: Array, K: Array, H: Array) -> None:
+        p, nx, bar = self.p, self.problem.nx, self.bar
+        for term, (s, i, j) in enumerate(zip(links.mode, links.receiver, links.sender, strict=True)):
+            rows, columns = slice(i * nx, (i + 1) * nx), bar.rows[j]
+            if links.with_loss[term]:
+                H[s, rows, columns] -= V[term] @ R[columns][:, links.columns[term]].T
+                continue
+            e_i, e_j, w = V[term, :, p : p + nx], V[term, :, p + nx : p + 2 * nx], V[term, :, p + 2 * nx :]
+            K[s, rows, j * nx : (j + 1) * nx] += e_j - e_i
+            C_j = bar.C_beta[columns, j * nx : (j + 1) * nx]
+            H[s, rows, columns] -= e_j @ C_j.T + w @ bar.D_beta[columns].T
 
 
-def slope(operator: Operator, inputs: Inputs, swept: Sweep, V: Array) -> Slope:
+def slope(model: ErrorModel, operator: Operator, inputs: Inputs, swept: Sweep, V: Array) -> Slope:
     """Carry X forward and collect; V (T, modes, nw, nw) has its rows in the order of the sweep."""
     horizon, modes, size, _ = swept.Y_bar.shape
-    p = operator.p
+    p, links = operator.p, operator.links
     X = np.zeros((modes, size, size))  # covariance of eta, by mode
     joint = np.zeros((horizon, modes, size + operator.nw, size + operator.nw))  # of [eta; w]
     spent = 0.0
@@ -86,17 +113,19 @@ def slope(operator: Operator, inputs: Inputs, swept: Sweep, V: Array) -> Slope:
         joint[k, :, :size, size:], joint[k, :, size:, size:] = GX.swapaxes(1, 2), GXG + V[k]
         X_next = operator.AB @ joint[k] @ operator.AB_T
         if len(operator.lossy):
-            FX = operator.F.reshape(modes, -1, p) @ X[:, :p, :p]
-            X_next[:, p:, p:] += FX.reshape(modes, size - p, -1) @ operator.F.swapaxes(1, 2)
+            lost = (operator.R @ joint[k] @ operator.R_T) * operator.same
+            X_next[:, p:, p:] += operator.H @ lost @ operator.H_T
+        if links is not None:
+            links.carry(X_next, joint[k])
         X = (operator.transition.T @ X_next.reshape(modes, -1)).reshape(X.shape)
-    rows = 2.0 * (swept.Y_bar[:, :, p:] @ (operator.AB @ joint)).sum(axis=0)  # (modes, n nx, n_eta + nw)
-    K_slope, H_slope = rows @ inputs.in_K_T, rows @ inputs.in_H_T
-    if inputs.lossy is not None:
-        FX = operator.F.reshape(modes, -1, p) @ joint[:, :, :p, :p]
-        YFX = 2.0 * (swept.Y_bar[:, :, p:, p:] @ FX.reshape(horizon, modes, size - p, -1)).sum(axis=0)
-        YFX = YFX.reshape(modes, size - p, -1, p).swapaxes(1, 2)  # (modes, lossy, n nx, nx)
-        H_slope = H_slope + (YFX @ inputs.lossy).sum(axis=1)
-    return Slope(np.asarray(K_slope), np.asarray(H_slope), -spent)
+    by_AB = 2.0 * (swept.Y_bar[:, :, p:] @ (operator.AB @ joint)).sum(axis=0)  # (modes, n nx, n_eta + nw)
+    by_H = np.zeros_like(model.H)
+    if len(operator.lossy):
+        lost = (operator.R @ joint @ operator.R_T) * operator.same
+        roots = np.sqrt(model.alpha[model.owner[operator.lossy]])
+        by_H[:, :, operator.lossy] = 2.0 * (swept.Y_bar[:, :, p:, p:] @ (operator.H @ lost)).sum(axis=0) * roots
+    by_V = None if links is None else links.by_V(swept.Y_bar, joint)
+    return Slope(*inputs.gains(model, by_AB, by_H, by_V), -spent)
 
 
 class GainSlope(NamedTuple):
@@ -113,12 +142,13 @@ def gain_slope(problem: Problem, K_bar: Array, H_bar: Array, *, horizon: int) ->
     At g = gamma_T^2 one W is singular, with null vector u. V = u u' put in there gives the derivative of u'W u by
     the gains, and the energy of the w that follow, with that of u, is its derivative by g.
     """
-    operator = Operator(error_model(problem, K_bar, H_bar))
+    model = error_model(problem, K_bar, H_bar)
+    operator = Operator(model)
     g, swept = critical_sweep(operator, horizon)
     k, s, u = critical(swept)
     V = np.zeros_like(swept.W_inverse)
     V[k, s] = np.outer(u, u)
-    slopes = slope(operator, Inputs(problem), swept, V)
+    slopes = slope(model, operator, Inputs(problem), swept, V)
     gamma = math.sqrt(g)
     scale = 1.0 / ((1.0 - slopes.g) * 2.0 * gamma)
     return GainSlope(gamma, scale * slopes.K_bar, scale * slopes.H_bar)

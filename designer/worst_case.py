@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from designer.error_model import ErrorModel
+from designer.error_model import ErrorModel, realised
 from designer.gain import Operator
 from designer.sensitivity import critical, critical_sweep
 
@@ -80,17 +81,20 @@ def _traces_of_w(operator: Operator, model: ErrorModel, initial: int, horizon: i
     return steps
 
 
-def path_gain(model: ErrorModel, modes: Sequence[int], theta: Array) -> Array:
-    """gamma_path(k), (steps + 1,), of one realised run: modes r(0), r(1), ... and theta (steps, n).
+def path_gain(
+    model: ErrorModel, modes: Sequence[int], theta: Array, delivered: NDArray[np.bool_] | None = None
+) -> Array:
+    """gamma_path(k), (steps + 1,), of one realised run: modes r(0), r(1), ..., theta (steps, n), and where links
+    are lossy delivered (steps, n, n).
 
     |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2 in that very run, with no expectation:
-    X <- A_k X A_k' + B_k B_k' from 0, with the realised theta in A_k, and gamma_path(k)^2 = lambda_max(M X M').
+    X <- A_k X A_k' + B_k B_k' from 0, the realised losses in A_k and B_k, and gamma_path(k)^2 = lambda_max(M X M').
     """
-    p, X = model.plant_states, np.zeros_like(model.A[0])
+    X, size = np.zeros_like(model.A[0]), model.size
     gains = [0.0]
-    for s, theta_k in zip(modes, theta, strict=True):
-        A_k = model.A[s].copy()
-        A_k[p:, :p] += np.tensordot(theta_k - model.beta, model.F[s], axes=1)
-        X = A_k @ X @ A_k.T + model.B[s] @ model.B[s].T
+    for k, (s, theta_k) in enumerate(zip(modes, theta, strict=True)):
+        AB = realised(model, s, theta_k, None if delivered is None else delivered[k])
+        A_k, B_k = AB[:, :size], AB[:, size:]
+        X = A_k @ X @ A_k.T + B_k @ B_k.T
         gains.append(math.sqrt(max(float(np.linalg.eigvalsh(model.M @ X @ model.M.T).max()), 0.0)))
     return np.array(gains)

@@ -136,7 +136,10 @@ def test_the_check_is_theorem_1_as_printed(gains: Gains) -> None:
     for s in range(4):
         A, B, M = model.A[s], model.B[s], model.M
         P_bar = sum(problem.markov.transition[s, t] * P[t] for t in range(4))
-        lost = sum(model.alpha[i] * model.F_i(s, i).T @ P_bar @ model.F_i(s, i) for i in range(4))
+        lost = sum(
+            model.alpha[i] * model.F_i(s, i)[:, : model.size].T @ P_bar @ model.F_i(s, i)[:, : model.size]
+            for i in range(4)
+        )
         printed = np.block(
             [[A.T @ P_bar @ A + lost - P[s], A.T @ P_bar @ B], [B.T @ P_bar @ A, B.T @ P_bar @ B - np.eye(1)]]
         )

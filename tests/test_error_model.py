@@ -93,7 +93,9 @@ def test_a_step_is_the_matrix_of_eq_10(network: tuple[Problem, Array, Array]) ->
     rng = np.random.default_rng(1)
     eta, w, theta = rng.normal(size=len(model.A[0])), rng.normal(size=problem.nw), np.zeros(problem.n)
     for s in range(len(problem.topologies)):
-        matrix = model.A[s] + sum((theta[i] - model.beta[i]) * model.F_i(s, i) for i in range(problem.n))
+        matrix = model.A[s] + sum(
+            (theta[i] - model.beta[i]) * model.F_i(s, i)[:, : model.size] for i in range(problem.n)
+        )
         np.testing.assert_allclose(step(model, s, theta, eta, w), matrix @ eta + model.B[s] @ w, rtol=1e-12)
 
 

@@ -58,7 +58,12 @@ class Histories:
                 theta = model.beta.copy()
                 theta[lossy] = arrived
                 chance = np.prod(np.where(theta[lossy] == 1.0, model.beta[lossy], 1.0 - model.beta[lossy]))
-                A = np.array([model.A[s] + sum((theta - model.beta)[i] * model.F_i(s, i) for i in lossy) for s in mode])
+                A = np.array(
+                    [
+                        model.A[s] + sum((theta - model.beta)[i] * model.F_i(s, i)[:, : model.size] for i in lossy)
+                        for s in mode
+                    ]
+                )
                 for t in range(len(model.A)) if k < horizon - 1 else [None]:
                     moved = model.transition[mode, t] if t is not None else np.ones(len(mode))
                     branches.append((self.probability * chance * moved, A, t if t is not None else 0))
@@ -271,7 +276,10 @@ def attained(model: ErrorModel, policy: Policy) -> float:
         energy += sum(float(np.trace(Gamma[s] @ X[s] @ Gamma[s].T)) for s in range(len(X)))
         closed = [
             (model.A[s] + model.B[s] @ Gamma[s]) @ X[s] @ (model.A[s] + model.B[s] @ Gamma[s]).T
-            + sum(model.alpha[i] * model.F_i(s, i) @ X[s] @ model.F_i(s, i).T for i in range(len(model.alpha)))
+            + sum(
+                model.alpha[i] * model.F_i(s, i)[:, : model.size] @ X[s] @ model.F_i(s, i)[:, : model.size].T
+                for i in range(len(model.alpha))
+            )
             for s in range(len(X))
         ]
         X = moved(model, np.array(closed))
@@ -313,7 +321,7 @@ def peak(model: ErrorModel, w: Array, *, initial: int) -> float:
             step[:size, :size], step[:size, size] = model.A[s], model.B[s] @ w_k
             after = step @ X[s] @ step.T
             for i, alpha_i in enumerate(model.alpha):
-                F_i = model.F_i(s, i)
+                F_i = model.F_i(s, i)[:, : model.size]
                 after[:size, :size] += alpha_i * F_i @ X[s, :size, :size] @ F_i.T
             following += model.transition[s][:, None, None] * after
         X = following
@@ -329,7 +337,9 @@ def test_the_path_gain_bounds_its_own_run_and_is_attained() -> None:
     response = np.zeros((model.A.shape[1], 0))
     expected = [0.0]
     for s, theta_k in zip(modes, theta, strict=True):
-        A_k = model.A[s] + sum((theta_k - model.beta)[i] * model.F_i(s, i) for i in range(len(model.beta)))
+        A_k = model.A[s] + sum(
+            (theta_k - model.beta)[i] * model.F_i(s, i)[:, : model.size] for i in range(len(model.beta))
+        )
         response = np.hstack([A_k @ response, model.B[s]])
         expected.append(np.linalg.norm(model.M @ response, ord=2))
     np.testing.assert_allclose(path_gain(model, modes, theta), expected, rtol=1e-9)

@@ -170,7 +170,8 @@ def unstable_plant(document: dict[str, Any]) -> None:
         (put_gamma_nan, "certificate: gamma: must be finite, got nan"),
         (put_gamma_0, "certificate: gamma: must be greater than 0, got 0"),
         (unstable_plant, "problem: plant: A is unstable: its spectral radius is 2 and must be below 1, "
-                         "because a node is not told which measurements are lost"),
+                         "because the errors contain the state; an unstable plant needs unbiased = true, "
+                         'and loss = "seen" at every node that loses measurements'),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_refused_in_one_sentence(tmp_path: Path, gains: Gains, edit: Edit, sentence: str) -> None:

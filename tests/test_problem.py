@@ -186,7 +186,8 @@ REFUSED = [
     (edited("A = [[0.5", "A = [[2020-01-01"), "plant: A: row 1 holds datetime.date(2020, 1, 1), which is not a number"),
     (edited("A = [[0.5", "A = [[1.0"),
      "plant: A is unstable: its spectral radius is 1 and must be below 1, "
-     "because a node is not told which measurements are lost"),
+     "because the errors contain the state; an unstable plant needs unbiased = true, "
+     'and loss = "seen" at every node that loses measurements'),
     # probabilities
     (edited("0.75\n", "0.0\n"),
      'node "left": arrival_probability: 0.0 is not in (0, 1]; 1 means that no measurement is ever lost'),

@@ -106,7 +106,10 @@ def test_36_is_the_schur_form_39_of_theorem_1(reduced: bool) -> None:
         P, P_bar = block_diagonal(R, Q)[0], np.zeros_like(block_diagonal(R, Q)[0])
         P_bar[:nx, :nx], P_bar[nx:, nx:] = R, Q_bar
         A, B = model.A[0], model.B[0]
-        lost = sum(model.alpha[i] * model.F_i(0, i).T @ P_bar @ model.F_i(0, i) for i in range(n))
+        lost = sum(
+            model.alpha[i] * model.F_i(0, i)[:, : model.size].T @ P_bar @ model.F_i(0, i)[:, : model.size]
+            for i in range(n)
+        )
         matrix_17 = np.block(
             [
                 [A.T @ P_bar @ A + lost - P, A.T @ P_bar @ B],

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, shape_text
@@ -115,7 +116,8 @@ class Gains(Model):
             for s, mode in enumerate(problem.mode_names)
         }
         node = problem.nodes[i]
-        return NodeGains(name, node.C, node.arrival_probability, problem.plant.M, links)
+        A = problem.plant.A if problem.unbiased else None
+        return NodeGains(name, node.C, node.arrival_probability, problem.plant.M, links, node.seen, A)
 
     @model_validator(mode="after")
     def _check_digest(self) -> Self:
@@ -145,7 +147,24 @@ class Gains(Model):
                             raise ValueError(
                                 f'{where}: from "{sender}" is {shape_text(gain)}; it must be {problem.nx} x {columns}'
                             )
+        if problem.unbiased:
+            _refuse_bias(problem, self.K)
         return self
+
+
+def _refuse_bias(problem: Problem, K: LinkMatrices) -> None:
+    """sum over j of a_ij K_ij = A, but for the rounding of K_ii."""
+    for s, topology in enumerate(problem.topologies):
+        for i, receiver in enumerate(problem.node_names):
+            heard = problem.neighbours(s, i)
+            terms = [topology.adjacency[i, j] * K[topology.name][receiver][problem.node_names[j]] for j in heard]
+            size = np.sum(np.abs(terms), axis=0) + np.abs(problem.plant.A)
+            bias = np.abs(np.sum(terms, axis=0) - problem.plant.A)
+            if (bias > 4.0 * (len(heard) + 2) * 2.0**-53 * size).any():
+                raise ValueError(
+                    f'K: mode "{topology.name}": node "{receiver}": the sum of a_ij K_ij differs from A by '
+                    f"{bias.max():.3g}; the problem says that its gains are unbiased"
+                )
 
 
 class Link(NamedTuple):
@@ -165,6 +184,8 @@ class NodeGains(NamedTuple):
     arrival_probability: float  # beta_i
     M: Array  # (nz, nx)
     links: dict[str, tuple[Link, ...]]  # mode -> what the node hears in it, itself among them
+    seen: bool = False  # whether it knows which of its measurements are lost
+    A: Array | None = None  # of the plant, where the gains are unbiased: a_ii K_ii is A less what others get
 
 
 def _same_names(where: str, found: dict[str, Any], expected: tuple[str, ...], what: str) -> None:

@@ -1,4 +1,7 @@
-"""The problem file: plant, nodes, topologies, Markov chain, disturbance. Eqs. (1)-(3) of Zhu et al. 2020."""
+"""The problem file: plant, nodes, topologies, Markov chain, disturbance. Eqs. (1)-(3) of Zhu et al. 2020.
+
+Not in the paper: losses that a node sees, links that lose messages, gains that are imposed to be unbiased.
+"""
 
 from __future__ import annotations
 
@@ -46,25 +49,32 @@ class Plant(Model):
             raise ValueError(
                 f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {counted(nx, 'column')}"
             )
-        radius = float(np.abs(np.linalg.eigvals(self.A)).max())
-        if radius >= 1.0:
-            raise ValueError(
-                f"A is unstable: its spectral radius is {radius:.6g} and must be below 1, "
-                "because a node is not told which measurements are lost"
-            )
         return self
 
 
 class Node(Model):
     """Eq. (2): y_i(k) = theta_i(k) C_i x(k) + D_i w(k). C_i: (ny_i, nx), D_i: (ny_i, nw).
 
-    `arrival_probability` is beta_i = P(theta_i(k) = 1) of eq. (3), in (0, 1].
+    `arrival_probability` is beta_i = P(theta_i(k) = 1) of eq. (3), in (0, 1]. `loss` says what the node knows of
+    theta_i(k): "hidden", as in the paper, nothing; "seen": a lost measurement does not arrive at all, and the
+    innovation theta_i (C_i x + D_i w - C_i x_hat_i) is then 0. None stands for "hidden".
     """
 
     name: Name
     C: Matrix
     D: Matrix
     arrival_probability: Number
+    loss: Literal["hidden", "seen"] | None = None
+
+    @property
+    def seen(self) -> bool:
+        """Whether the node knows which of its measurements are lost."""
+        return self.loss == "seen"
+
+    @field_validator("loss")
+    @classmethod
+    def _one_word(cls, value: str | None) -> str | None:
+        return None if value == "hidden" else value  # so that the digest does not depend on whether it is written
 
     @field_validator("arrival_probability")
     @classmethod
@@ -88,6 +98,24 @@ class Topology(Model):
 
     name: Name
     adjacency: Matrix
+
+
+class LossyLink(Model):
+    """Messages from `sender` reach `receiver` with this probability, independently at every step.
+
+    Where one does not, the receiver puts its own estimate in place of the sender's and 0 in place of its innovation.
+    """
+
+    receiver: str
+    sender: str
+    delivery_probability: Number
+
+    @field_validator("delivery_probability")
+    @classmethod
+    def _in_range(cls, value: float) -> float:
+        if not 0.0 < value <= 1.0:
+            raise ValueError(f"{value} is not in (0, 1]; 1 means that every message arrives")
+        return value
 
 
 class MarkovChain(Model):
@@ -147,6 +175,8 @@ class Problem(Model):
     topologies: tuple[Topology, ...] = Field(alias="topology", min_length=1)
     markov: MarkovChain
     disturbance: Disturbance = Quiet()
+    links: tuple[LossyLink, ...] | None = Field(default=None, alias="link", min_length=1)
+    unbiased: bool | None = Field(default=None, strict=True)  # sum over j of a_ij K_ij = A, imposed; None: it is not
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -205,6 +235,23 @@ class Problem(Model):
     def beta(self) -> Array:
         """Arrival probabilities, (n,)."""
         return np.array([node.arrival_probability for node in self.nodes])
+
+    @cached_property
+    def delivery(self) -> Array:
+        """Delivery probabilities rho_ij, from node j to node i, (n, n); 1 where no link says otherwise."""
+        rho = np.ones((self.n, self.n))
+        for link in self.links or ():
+            rho[self.node_names.index(link.receiver), self.node_names.index(link.sender)] = link.delivery_probability
+        return rho
+
+    @property
+    def carries_plant(self) -> bool:
+        """Whether the errors depend on x itself: not where the gains are unbiased and every loss is seen."""
+        return not self.unbiased or bool(self._hidden())
+
+    def _hidden(self) -> list[str]:
+        """The nodes that lose measurements without knowing it."""
+        return [node.name for node in self.nodes if node.arrival_probability < 1.0 and not node.seen]
 
     def node_index(self, name: str) -> int:
         """Index of a node; InputError names the nodes there are."""
@@ -273,6 +320,49 @@ class Problem(Model):
                 if adjacency[i, i] == 0.0:
                     raise ValueError(f'{where} has 0 for "{receiver}" itself; a node hears itself, a_ii = 1')
         return self
+
+    @field_validator("unbiased")
+    @classmethod
+    def _true_or_none(cls, value: bool | None) -> bool | None:
+        return value or None
+
+    @model_validator(mode="after")
+    def _check_links(self) -> Self:
+        known: set[tuple[str, str]] = set()
+        for link in self.links or ():
+            where = f'link from "{link.sender}" to "{link.receiver}"'
+            for name in (link.sender, link.receiver):
+                if name not in self.node_names:
+                    raise ValueError(
+                        f'{where}: node "{name}" does not exist; the problem has nodes {listed(self.node_names)}'
+                    )
+            if link.sender == link.receiver:
+                raise ValueError(f"{where}: a node has its own numbers always; name two nodes")
+            if self.node_names.index(link.sender) not in self.ever_heard(self.node_names.index(link.receiver)):
+                raise ValueError(f'{where}: "{link.receiver}" hears "{link.sender}" in no topology')
+            if (link.receiver, link.sender) in known:
+                raise ValueError(f"{where} is there twice; give it one delivery_probability")
+            known.add((link.receiver, link.sender))
+        return self
+
+    @model_validator(mode="after")
+    def _check_stability(self) -> Self:
+        radius = float(np.abs(np.linalg.eigvals(self.plant.A)).max())
+        if radius < 1.0 or not self.carries_plant:
+            return self
+        if self.unbiased:
+            raise ValueError(
+                f"plant: A is unstable, its spectral radius is {radius:.6g}, and {self._hidden_text()}: "
+                'its errors then contain the state; give it loss = "seen"'
+            )
+        raise ValueError(
+            f"plant: A is unstable: its spectral radius is {radius:.6g} and must be below 1, because the errors "
+            "contain the state; an unstable plant needs unbiased = true, "
+            'and loss = "seen" at every node that loses measurements'
+        )
+
+    def _hidden_text(self) -> str:
+        return f'node "{self._hidden()[0]}" does not know which of its measurements are lost'
 
     @model_validator(mode="after")
     def _check_markov(self) -> Self:

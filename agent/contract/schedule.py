@@ -11,11 +11,12 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.problem import DampedSine, Impulse, Problem, Quiet, Samples, White
 
-MODES, LOSSES, DISTURBANCE = 1, 2, 3  # the streams
+MODES, LOSSES, DISTURBANCE, DELIVERIES = 1, 2, 3, 4  # the streams
 _BLOCK = 256  # steps drawn at once; results do not depend on it
 _WORDS = 4  # 64-bit words that one count of Philox gives
 
@@ -67,6 +68,23 @@ class Losses:
     def at(self, step: int) -> Array:
         """1.0 where the plant is in y_i(k), 0.0 where the measurement is lost, (n,)."""
         return (self._stream.at(step) < self._beta).astype(np.float64)
+
+
+class Deliveries:
+    """Whether the message of node j reaches node i at a step: independent, true with probability rho_ij."""
+
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        links, names = problem.links or (), problem.node_names
+        self._n = problem.n
+        self._at = [names.index(link.receiver) for link in links], [names.index(link.sender) for link in links]
+        self._rho = np.array([link.delivery_probability for link in links])
+        self._stream = Stream(seed=seed, stream=DELIVERIES, width=len(links))  # in the order of the problem file
+
+    def at(self, step: int) -> NDArray[np.bool_]:
+        """(n, n): row i for what node i gets; true where no message is ever lost."""
+        delivered = np.ones((self._n, self._n), dtype=bool)
+        delivered[self._at] = self._stream.at(step) < self._rho
+        return delivered
 
 
 class DisturbanceSource:

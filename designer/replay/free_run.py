@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
+from designer.error_model import realised
 from designer.replay.log import Log
 from designer.replay.proofs import FLOOR, Central, Check, Drawn, Inputs, numbers
 
@@ -46,9 +47,7 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
 
     @lru_cache(maxsize=64)  # small networks have few different ones, large ones no room for many
     def transition(s: int, theta: bytes) -> Array:
-        A_k = model.A[s].copy()
-        A_k[nx:, :nx] += np.tensordot(np.frombuffer(theta) - model.beta, model.F[s], axes=1)
-        return np.asarray(A_k)
+        return realised(model, s, np.frombuffer(theta))[:, :size]
 
     noise = [B_s @ B_s.T for B_s in model.B]
     eta, covariances, diagonal = np.zeros(size), np.zeros((2, size, size)), np.arange(size)

@@ -226,8 +226,8 @@ def step_checks(log: Log, central: Central, inputs: Inputs, eta: Array, now: sli
         unknown = np.isnan(state)
         state = np.where(unknown, 0.0, state)
         eta_next = state @ model.A[s].T + w[at] @ model.B[s].T
-        lost = np.tensordot(d_theta, model.F[s], axes=1)  # (steps, n nx, nx): sum over i of (theta_i - beta_i) F_i
-        eta_next[:, nx:] += np.einsum("krp,kp->kr", lost, state[:, :nx]) - u[at] @ central.H_bar[s].T
+        taken = (np.hstack([state, w[at]]) @ model.R.T) * d_theta[:, model.owner]  # (steps, sum ny)
+        eta_next[:, nx:] -= (taken + u[at]) @ central.H_bar[s].T
         touched = unknown.astype(float) @ (model.A[s] != 0.0).T.astype(float) > 0.0
         predicted[at] = np.where(touched, np.nan, eta_next)
         magnitude[at] = central.magnitude(s, state[:, :nx], log.x_hat[now][at], w[at], log.y[now][at])
