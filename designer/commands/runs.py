@@ -1,0 +1,85 @@
+"""`peakmesh run` and `peakmesh demo`: a whole network on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import agent.cli
+from agent.contract.errors import EXIT_GOOD, InputError
+from agent.contract.files import refuse_overwrite
+from designer.commands import PROBLEM
+from designer.commands.design import design_and_save, design_text
+from designer.commands.recordings import write_pictures
+
+
+def add_demo(commands: agent.cli.Subcommands) -> None:
+    """Describe `demo` to the parser."""
+    demo = agent.cli.add_command(
+        commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)"
+    )
+    demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
+    agent.cli.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
+
+
+def demo_command(options: argparse.Namespace) -> int:
+    """`peakmesh demo`: the whole job; its files go to a folder of their own."""
+    from designer.problems import find
+    from designer.replay import replay
+
+    problem = find(options.problem)
+    folder = options.output or Path("recordings") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; --output takes the folder for the demo's files")
+    folder.mkdir(parents=True, exist_ok=True)
+    gains_path, options.output = folder / "gains.json", folder / "run.mcap"
+    for path in (gains_path, options.output):
+        refuse_overwrite(path, force=options.force)
+
+    gains, designed = design_and_save(problem, "theorem2", gains_path, force=options.force)
+    _say(options, f"1. design\n{design_text(designed)}")
+    ran = agent.cli.run_gains(gains_path, gains, options)
+    _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{agent.cli.run_text(ran)}")
+    verdict = replay(options.output)
+    _say(options, f"\n3. replay\n{verdict.text()}")
+    pictures = write_pictures(options.output, folder, force=options.force)
+    _say(options, "\n4. pictures\n" + "\n".join(pictures))
+    if options.json:
+        print(json.dumps({"design": designed, "run": ran, "replay": verdict.document(), "pictures": pictures}))
+    return verdict.exit_code
+
+
+def _say(options: argparse.Namespace, text: str) -> None:
+    """Print a part of the demo as soon as it is known; with --json only the object at the end."""
+    if not options.json:
+        print(text, flush=True)
+
+
+def add_run(commands: agent.cli.Subcommands) -> None:
+    """Describe `run` to the parser."""
+    run = agent.cli.add_command(commands, "run", run_command, "run every role as a process on this machine")
+    run.add_argument("gains", metavar="PROBLEM_OR_GAINS", help=f"gains file, {PROBLEM}")
+    agent.cli.add_run_options(run)
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """`peakmesh run PROBLEM_OR_GAINS`: a problem is designed first, its gains stand beside the recording."""
+    path = Path(options.gains)
+    if path.suffix == ".json" or (path.is_file() and path.suffix != ".toml"):
+        options.gains = path
+        return agent.cli.run_command(options)
+    from designer.problems import find
+
+    problem = find(options.gains)
+    if options.output is None:
+        options.output = agent.cli.default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
+    refuse_overwrite(options.output, force=options.force)
+    path = options.output.with_suffix(".gains.json")
+    gains, _ = design_and_save(problem, "theorem2", path, force=options.force)
+    print(f"designed {path}, gamma = {gains.certificate.gamma:.6f}", file=sys.stderr)
+    result = {"gains": str(path), **agent.cli.run_gains(path, gains, options)}
+    print(json.dumps(result) if options.json else f"{agent.cli.run_text(result)}\ngains      {path}")
+    return EXIT_GOOD

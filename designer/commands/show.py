@@ -1,0 +1,25 @@
+"""`peakmesh show`: what a file is."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import agent.cli
+from agent.contract.errors import EXIT_GOOD
+
+
+def add_show(commands: agent.cli.Subcommands) -> None:
+    """Describe `show` to the parser."""
+    show = agent.cli.add_command(commands, "show", show_command, "what a file is; without one, the built-in problems")
+    show.add_argument("file", nargs="?", metavar="FILE", help="problem, gains file or recording")
+    show.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def show_command(options: argparse.Namespace) -> int:
+    """`peakmesh show [FILE]`."""
+    from designer import show
+
+    facts = show.describe(options.file)
+    print(json.dumps(facts) if options.json else show.text(facts))
+    return EXIT_GOOD
