@@ -31,6 +31,7 @@ WHO_MAY_IMPORT = {
     "scipy": ["designer/lmi/"],
     "matplotlib": ["designer/figures.py"],
     "rich": ["agent/cli.py", "designer/commands/"],
+    "distributed": ["designer/workers.py"],
 }
 
 # The contract is made of leaf modules: of peakmesh they import each other alone.
@@ -174,6 +175,8 @@ def loaded(modules: str) -> set[str]:
         ("designer.cli", "numpy zenoh mcap cvxpy clarabel scipy matplotlib rich"),
         # replay: nothing of the nodes' arithmetic, no network
         ("designer.replay", "agent.filter agent.inbox agent.roles agent.bus zenoh cvxpy clarabel scipy matplotlib"),
+        # a worker, before its first job: what sets the number of its threads comes before numpy
+        ("designer.workers", "numpy distributed"),
         # the certificate: no solver
         ("designer.certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
     ],

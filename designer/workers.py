@@ -1,0 +1,112 @@
+"""Many independent jobs at once: on processes of this machine, or on a Dask cluster that runs already.
+
+One function, `each`. It knows nothing of what the jobs are.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from agent.contract.errors import InputError, RunBroken
+
+PATIENCE = 5  # seconds for a Dask scheduler to answer, and for the first of its workers to be there
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def each(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    dask: str | None = None,
+    processes: int | None = None,
+) -> Iterator[Result]:
+    """function(item) for every item, in the order of the items, each as soon as it and all before it are there.
+
+    Runs on `processes` processes of this machine (None: one for each core), in this one where one would do, or on
+    the Dask cluster whose scheduler listens at `dask`. Function, items and results must be picklable. An exception
+    of the function is raised here and ends the rest; so do Ctrl-C and closing the iterator, and no process stays.
+    Raises InputError where nobody answers at `dask`, RunBroken where a worker dies.
+    """
+    if processes is not None and processes < 1:
+        raise InputError(f"processes is {processes}; it must be at least 1")
+    if dask is not None:
+        return _on_cluster(function, items, dask)
+    number = min(processes or len(os.sched_getaffinity(0)), len(items))
+    return map(function, items) if number <= 1 else _on_processes(function, items, number)
+
+
+def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], number: int) -> Iterator[Result]:
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
+    try:
+        yield from pool.map(function, items)
+    except BrokenProcessPool:
+        raise RunBroken("a worker process died; was there too little memory? --processes asks for fewer") from None
+    finally:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.terminate()  # it is idle, or at a job whose result nobody waits for any more
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """Before the first job, and so before numpy is loaded: one core each; whoever started it decides when it ends."""
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], address: str) -> Iterator[Result]:
+    try:
+        import distributed
+    except ImportError:
+        raise InputError(
+            "a Dask cluster needs the package distributed, which is not installed; pip install 'peakmesh[dask]'"
+        ) from None
+    try:
+        asyncio.run(_greet(address))
+        client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        why = str(error) or f"nothing came within {PATIENCE} s"
+        raise InputError(f"no Dask scheduler answers at {address}: {why}") from None
+    try:
+        try:
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise InputError(
+                f"the Dask cluster at {address} has no workers; start one: dask worker {address}"
+            ) from None
+        futures = client.map(function, items, pure=False)
+        try:
+            for future in futures:
+                yield future.result()
+        except distributed.KilledWorker as error:
+            raise RunBroken(f"workers of the Dask cluster at {address} died: {error}") from None
+        finally:
+            client.cancel(futures)
+    finally:
+        client.close()
+
+
+async def _greet(address: str) -> None:
+    """A Client would wait for ever for the first words of somebody who listens and says nothing."""
+    from distributed.comm import connect
+
+    comm = await asyncio.wait_for(connect(address, timeout=PATIENCE), PATIENCE)
+    await comm.close()
