@@ -77,8 +77,10 @@ def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
 
 
 def plant_lyapunov(model: ErrorModel, P: Array) -> Array | None:
-    """P0 = diag{R0, 0} with R0 - A'R0 A >= R/2 for the plant alone, (modes, n_eta, n_eta)."""
+    """P0 = diag{R0, 0} with R0 - A'R0 A >= R/2 for the plant alone, (modes, n_eta, n_eta); or None."""
     p = model.plant_states
+    if not p:
+        return None
     A, R = model.A[0, :p, :p], P[0, :p, :p]
     term, R0 = R, R.copy()
     for _ in range(_MOST_STEPS):

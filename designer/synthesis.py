@@ -20,6 +20,7 @@ from designer.error_model import link_gains, stacked_links, stacks
 from designer.exact_design import design_exact, with_ladder
 from designer.inwards import inwards
 from designer.lmi import LmiSolution
+from designer.lmi.units import spectral_radius
 
 
 class Designed(NamedTuple):
@@ -62,7 +63,8 @@ def design(problem: Problem, *, method: str = "theorem2", progress: Callable[[Pr
 def recover(problem: Problem, solution: LmiSolution) -> tuple[Array, Array]:
     """Eq. (38): K_bar^s = Q_bar(s)^-1 Y^s (modes, n nx, n nx) and H_bar^s = Q_bar(s)^-1 X^s (modes, n nx, sum ny).
 
-    Node by node: Q_bar is block diagonal, so a block that is zero in X and Y stays exactly zero.
+    Node by node: Q_bar is block diagonal, so a block that is zero in X and Y stays exactly zero. Where the gains
+    have to be unbiased, K_ii is what the other K_ij leave of A.
     """
     modes, n, nx = len(problem.topologies), problem.n, problem.nx
     Q_bar = np.tensordot(problem.markov.transition, solution.Q, axes=1)  # (modes, n, nx, nx)
@@ -71,17 +73,23 @@ def recover(problem: Problem, solution: LmiSolution) -> tuple[Array, Array]:
         H = np.linalg.solve(Q_bar, solution.X.reshape(modes, n, nx, -1))
     except np.linalg.LinAlgError:
         raise _unconfirmed(problem, solution, "Q_bar(s) is singular") from None
+    if problem.unbiased:
+        blocks, i = K.reshape(modes, n, nx, n, nx), np.arange(n)
+        blocks[:, i, :, i] = 0.0
+        blocks[:, i, :, i] = problem.plant.A - blocks.sum(axis=3).swapaxes(0, 1)
     return np.asarray(K).reshape(solution.Y.shape), np.asarray(H).reshape(solution.X.shape)
 
 
 def block_diagonal(R: Array, Q: Array) -> Array:
-    """P(s) = diag{R, Q_1(s), ..., Q_n(s)}, (modes, nx (n + 1), nx (n + 1)), from R (nx, nx), Q (modes, n, nx, nx)."""
+    """P(s) = diag{R, Q_1(s), ..., Q_n(s)}, (modes, n_eta, n_eta), from R (nx, nx) or (0, 0), Q (modes, n, nx, nx)."""
     modes, n, nx, _ = Q.shape
-    P = np.zeros((modes, n + 1, nx, n + 1, nx))
-    P[:, 0, :, 0, :] = R
+    p = len(R)
+    P = np.zeros((modes, p + n * nx, p + n * nx))
+    P[:, :p, :p] = R
     for i in range(n):
-        P[:, i + 1, :, i + 1, :] = Q[:, i]
-    return P.reshape(modes, nx * (n + 1), nx * (n + 1))
+        rows = slice(p + i * nx, p + (i + 1) * nx)
+        P[:, rows, rows] = Q[:, i]
+    return P
 
 
 def _confirm(problem: Problem, solution: LmiSolution) -> Designed:
@@ -95,10 +103,13 @@ def _confirm(problem: Problem, solution: LmiSolution) -> Designed:
 
 
 def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
-    """Gains and P together a little inside the LMI, so that P keeps its form; None: not confirmed that way."""
-    M = np.hstack([np.zeros((problem.n * problem.nz, problem.nx)), stacks(problem).M])
-    for t in STEPS_INWARDS:
-        moved = inwards(problem, solution, t)
+    """Gains and P together a little inside the LMI, so that P keeps its form; None: not confirmed that way.
+
+    For an unstable plant the answer itself has something to spare: the LMI was solved with a margin.
+    """
+    M = np.hstack([np.zeros((problem.n * problem.nz, len(solution.R))), stacks(problem).M])
+    for t in STEPS_INWARDS if spectral_radius(problem) < 1.0 else (0.0,):
+        moved = inwards(problem, solution, t) if t else solution
         K, H = _links(problem, moved)
         P = block_diagonal(moved.R, moved.Q)
         if not all(positive(P_s) for P_s in P):
@@ -127,15 +138,15 @@ def _unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Un
 
 
 def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float) -> Certificate:
-    P, verdict, nx = confirmed.P, confirmed.verdict, problem.nx
+    P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.nx if problem.carries_plant else 0
     modes, nodes = problem.mode_names, problem.node_names
     structured = confirmed.form == "structured"
-    parts = [slice(i * nx, (i + 1) * nx) for i in range(1, problem.n + 1)]
+    parts = [slice(p + i * nx, p + (i + 1) * nx) for i in range(problem.n)]
     return Certificate(
         gamma=verdict.gamma,
         kind="lyapunov",
         form=confirmed.form,
-        R=P[0, :nx, :nx] if structured else None,
+        R=P[0, :p, :p] if structured and p else None,
         Q={
             mode: {node: P[s, part, part] for node, part in zip(nodes, parts, strict=True)}
             for s, mode in enumerate(modes)

@@ -41,6 +41,39 @@ def random_problem(
     return Problem.from_document(document)
 
 
+def real_network(
+    problem: Problem,
+    *,
+    seen: bool | list[str] = False,
+    delivery: float | None = None,
+    unbiased: bool = False,
+    radius: float | None = None,
+) -> Problem:
+    """The problem with what is not in the paper.
+
+    `seen`: the nodes that see their losses, or all; `delivery`: of every link that some topology has; `radius`: the
+    spectral radius that A is scaled to.
+    """
+    document = problem.document()
+    for node in document["node"]:
+        if seen is True or (seen and node["name"] in seen):
+            node["loss"] = "seen"
+    if delivery is not None:
+        names = problem.node_names
+        document["link"] = [
+            {"receiver": receiver, "sender": names[j], "delivery_probability": delivery}
+            for i, receiver in enumerate(names)
+            for j in problem.ever_heard(i)
+            if i != j
+        ]
+    if unbiased:
+        document["unbiased"] = True
+    if radius is not None:
+        A = problem.plant.A
+        document["plant"]["A"] = (A * radius / np.abs(np.linalg.eigvals(A)).max()).tolist()
+    return Problem.from_document(document)
+
+
 def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Array, Array]:
     """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) with the sparsity of (9)."""
     rng = np.random.default_rng(seed)

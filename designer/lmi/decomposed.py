@@ -1,15 +1,23 @@
-"""Theorem 2 of Zhu et al. 2020 for the state [x; e], node by node: the same optimum from many small inequalities.
+"""The decomposed LMI: the optimum of Theorem 2 of Zhu et al. 2020 from many small inequalities; and beyond the paper.
 
-For each mode s, with Q_bar_i = sum_t pi_st Q_i(t), N the nodes that node i hears, X = Q_bar H and Y = Q_bar K:
+For each mode s, with Q_bar_i = sum_t pi_st Q_i(t), N the nodes that node i hears, X = Q_bar H and Y = Q_bar K, each
+with a_ij; rho_ij = 1 where no link loses messages; Dm_j = D_j, or beta_j D_j where node j sees its losses:
 
-    node i   [S_i, G_i'; G_i, Q_bar_i] >= 0, G_i = [Q_bar_i A - sum_j Y_ij | Q_bar_i B - sum_j X_ij D_j
-                                                    | (Y_ij - beta_j X_ij C_j) for j in N],  S_i over (x, w, e_N) free
-    link ij  [T_ij, X_ij'; X_ij, Q_bar_i] >= 0 where alpha_j > 0, T_ij free
-    balance  diag{R, I, Q(s)} - [A B]'R[A B] - sum_i S_i - sum_ij alpha_j C_j'T_ij C_j >= 0, over (x, w, e)
+    node i   [S_i, G_i'; G_i, Q_bar_i] >= 0, S_i over (x, w, e_N) free,
+             G_i = [Q_bar_i A - sum_j Y_ij | Q_bar_i B - sum_j rho_ij X_ij Dm_j
+                    | rho_ij (Y_ij - beta_j X_ij C_j) for j in N, and sum_j (1 - rho_ij) Y_ij more for e_i]
+    loss ij  [T_ij, X_ij'; X_ij, Q_bar_i] >= 0 where alpha_j > 0, T_ij free
+    link ij  [U_ij, V_ij'; V_ij, Q_bar_i] >= 0 where rho_ij < 1, U_ij over (e_i, e_j, w) free,
+             V_ij = [-Y_ij | Y_ij - beta_j X_ij C_j | -X_ij Dm_j]
+    balance  diag{R, I, Q(s)} - [A B]'R[A B] - sum_i S_i - sum_ij alpha_j rho_ij r_j'T_ij r_j
+             - sum_ij rho_ij (1 - rho_ij) U_ij >= 0, over (x, w, e); r_j = C_j x, or C_j e_j + D_j w where j sees
     peak i   [Q_i(s), M'; M, delta I] >= 0
 
-and R >= 0 once. The balance is large and sparse: it is split along a tree of cliques into pieces that exchange what
-they share. In each piece one node needs no S_i: what is left of the piece serves. docs/decomposed.md derives it all.
+and R >= 0 once. Where the gains have to be unbiased, Y_ii stands for Q_bar_i A less the other Y_ij, so that G_i has
+no x; and where no loss is hidden from its node either, x and R are left out of it all.
+
+The balance is large and sparse: it is split along a tree of cliques into pieces that exchange what they share. In
+each piece one node needs no S_i: what is left of the piece serves. docs/decomposed.md derives it all.
 """
 
 from __future__ import annotations
@@ -23,14 +31,15 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Solver
-from agent.contract.problem import Problem
+from agent.contract.problem import Node, Problem
 from designer.error_model import measurement_slices
 from designer.lmi import LmiSolution, conic
 from designer.lmi.cliques import clique_tree
 from designer.lmi.cones import Assembly, Cones, Indices, Inequality
-from designer.lmi.units import Units, natural_units, rescaled
+from designer.lmi.units import Units, natural_units, rescaled, spectral_radius
 
 Link = tuple[int, int]  # (i, j): node i hears node j
+MARGIN = 1e-6  # of the balance, for unstable plants: designer.inwards knows no way inwards there
 _ADVICE = "try the problem in other units, so that its numbers are near 1"
 
 
@@ -58,11 +67,13 @@ class Mode(NamedTuple):
 
     Q: list[Indices]
     X: dict[Link, Indices]
-    Y: dict[Link, Indices]
+    Y: dict[Link, Indices]  # without Y_ii where the gains have to be unbiased
     T: dict[Link, Indices]  # links with alpha_j > 0
+    U: dict[Link, Indices]  # links with rho_ij < 1
     balance: list[Piece]
     nodes: list[NodePart]
-    links: dict[Link, Inequality]
+    losses: dict[Link, Inequality]  # of measurements
+    links: dict[Link, Inequality]  # of messages
     peaks: list[Inequality]
 
 
@@ -70,7 +81,7 @@ class Lmi(NamedTuple):
     """The whole problem: minimise delta, over all modes."""
 
     delta: Indices
-    R: Indices
+    R: Indices  # (nx, nx); (0, 0) where x is left out
     modes: list[Mode]
     cones: Cones
 
@@ -86,13 +97,14 @@ def solve(problem: Problem) -> LmiSolution:
         (conic.clarabel, " on rescaled data"),
         (conic.scs, " on rescaled data"),
     ]
+    margin = 0.0 if spectral_radius(problem) < 1.0 else MARGIN
     failures: list[str] = []
     inaccurate: LmiSolution | None = None  # the answer of a solver that stalled, for want of a better one
     for solver, remark in attempts:
         if not conic.installed(solver) or (inaccurate is not None and solver is conic.scs):
             continue
         units = natural_units(problem) if remark else Units(np.ones(problem.nx), 1.0)
-        lmi = assemble(rescaled(problem, units))
+        lmi = assemble(rescaled(problem, units), margin=margin)
         q = np.zeros(lmi.cones.A.shape[1])
         q[lmi.delta] = 1.0
         u, record = solver(lmi.cones, q)
@@ -117,30 +129,33 @@ def solve(problem: Problem) -> LmiSolution:
     )
 
 
-def assemble(problem: Problem) -> Lmi:
-    """Unknowns and inequalities of every mode."""
+def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
+    """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance."""
     build, nx, n = Assembly(), problem.nx, problem.n
-    delta, R = build.unknown(1, 1), build.symmetric(nx)
-    positive = build.inequality()  # R >= 0: the balance implies it for stable plants only
-    x = positive.append(nx)
-    positive.add(x, x, R)
+    delta, R = build.unknown(1, 1), build.symmetric(nx if problem.carries_plant else 0)
+    if problem.carries_plant:
+        positive = build.inequality()  # R >= 0: the balance implies it for stable plants only
+        x = positive.append(nx)
+        positive.add(x, x, R)
     Q = [[build.symmetric(nx) for _ in range(n)] for _ in problem.topologies]
     modes = []
     for s, weights in enumerate(problem.markov.transition):
         heard = [problem.neighbours(s, i) for i in range(n)]
         links = [(i, j) for i in range(n) for j in heard[i]]
         X = {(i, j): build.unknown(nx, len(problem.nodes[j].C)) for i, j in links}
-        Y = {link: build.unknown(nx, nx) for link in links}
-        balance = _balance(build, problem, R, Q[s], heard)
+        Y = {(i, j): build.unknown(nx, nx) for i, j in links if i != j or not problem.unbiased}
+        balance = _balance(build, problem, R, Q[s], heard, 1.0 - margin)
         home = [_home(balance, heard_i) for heard_i in heard]
         spared = {k: max((i for i in range(n) if home[i] == k), key=lambda i: len(heard[i])) for k in set(home)}
-        mode = Mode(Q[s], X, Y, T={}, balance=balance, nodes=[], links={}, peaks=[])
+        mode = Mode(Q[s], X, Y, T={}, U={}, balance=balance, nodes=[], losses={}, links={}, peaks=[])
         for i in range(n):
             Q_bar = [(float(weight), Q[t][i]) for t, weight in enumerate(weights) if weight > 0.0]
             piece = balance[home[i]]
             mode.nodes.append(_node(build, problem, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i))
             for j in heard[i]:
                 if problem.beta[j] < 1.0:
+                    _loss(build, problem, mode, (i, j), Q_bar, piece)
+                if problem.delivery[i, j] < 1.0:
                     _link(build, problem, mode, (i, j), Q_bar, piece)
             mode.peaks.append(_peak(build, problem, Q[s][i], delta))
         modes.append(mode)
@@ -148,29 +163,31 @@ def assemble(problem: Problem) -> Lmi:
 
 
 def _balance(
-    build: Assembly, problem: Problem, R: Indices, Q: list[Indices], heard: list[tuple[int, ...]]
+    build: Assembly, problem: Problem, R: Indices, Q: list[Indices], heard: list[tuple[int, ...]], kept: float
 ) -> list[Piece]:
-    """diag{R, I, Q(s)} - [A B]'R[A B] in pieces, one for each clique; all of them have (x, w)."""
-    nx, nw = problem.nx, problem.nw
+    """kept diag{R, I, Q(s)} - [A B]'R[A B] in pieces, one for each clique; all of them have (x, w)."""
+    nx, nw, p = problem.nx, problem.nw, len(R)
     tree = clique_tree([j + 1 for j in heard_i] for heard_i in heard)
     pieces = []
     for clique in tree:
         matrix = build.inequality()
-        pieces.append(Piece(matrix, {v: matrix.append(nx if v else nx + nw) for v in clique.vertices}))
+        pieces.append(Piece(matrix, {v: matrix.append(nx if v else p + nw) for v in clique.vertices}))
     placed: set[int] = set()
     for piece, clique in zip(pieces, tree, strict=True):
         for v in set(clique.vertices) - placed - {0}:
-            piece.matrix.add(piece.at[v], piece.at[v], Q[v - 1])
+            piece.matrix.add(piece.at[v], piece.at[v], Q[v - 1], factor=kept)
         placed |= set(clique.vertices)
         if clique.above is not None:
             U, above = build.symmetric(len(piece.rows(clique.shared))), pieces[clique.above]
             piece.matrix.add(piece.rows(clique.shared), piece.rows(clique.shared), U, factor=-1.0)
             above.matrix.add(above.rows(clique.shared), above.rows(clique.shared), U)
-    first, A_B = pieces[0], np.hstack([problem.plant.A, problem.plant.B])
-    x, w = np.split(first.at[0], [nx])
-    first.matrix.add(x, x, R)
-    first.matrix.add_number(w, w, np.eye(nw))
-    first.matrix.add(first.at[0], first.at[0], R, factor=-1.0, left=A_B.T, right=A_B)
+    first = pieces[0]
+    x, w = np.split(first.at[0], [p])
+    first.matrix.add_number(w, w, kept * np.eye(nw))
+    if p:
+        A_B = np.hstack([problem.plant.A, problem.plant.B])
+        first.matrix.add(x, x, R, factor=kept)
+        first.matrix.add(first.at[0], first.at[0], R, factor=-1.0, left=A_B.T, right=A_B)
     return pieces
 
 
@@ -191,36 +208,46 @@ def _node(
     spared: bool,
 ) -> NodePart:
     """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there."""
-    nx, nw, plant = problem.nx, problem.nw, problem.plant
+    nx, nw, plant, rho = problem.nx, problem.nw, problem.plant, problem.delivery
+    if problem.unbiased:
+        piece = Piece(piece.matrix, {**piece.at, 0: piece.at[0][-nw:]})  # x is not in G_i
     vertices = (0, *(j + 1 for j in heard))
     S: Indices | None = None
     part = piece
     if not spared:
         matrix = build.inequality()
-        part = Piece(matrix, {v: matrix.append(nx if v else nx + nw) for v in vertices})
+        part = Piece(matrix, {v: matrix.append(len(piece.at[v])) for v in vertices})
         S = build.symmetric(matrix.order)
         matrix.add(part.rows(vertices), part.rows(vertices), S)
         piece.matrix.add(piece.rows(vertices), piece.rows(vertices), S, factor=-1.0)
     matrix, last = part.matrix, part.matrix.append(nx)
-    x, w = np.split(part.at[0], [nx])
+    x, w, e_i = part.at[0][:-nw], part.at[0][-nw:], part.at[i + 1]
     for weight, Q_i in Q_bar:
-        matrix.add(x, last, Q_i, factor=weight, left=plant.A.T)
+        matrix.add(e_i if problem.unbiased else x, last, Q_i, factor=weight, left=plant.A.T)
         matrix.add(w, last, Q_i, factor=weight, left=plant.B.T)
         matrix.add(last, last, Q_i, factor=weight)
     for j in heard:
-        node, X, Y, e_j = problem.nodes[j], mode.X[i, j].T, mode.Y[i, j].T, part.at[j + 1]
-        matrix.add(x, last, Y, factor=-1.0)
-        matrix.add(w, last, X, factor=-1.0, left=node.D.T)
-        matrix.add(e_j, last, Y)
-        matrix.add(e_j, last, X, factor=-node.arrival_probability, left=node.C.T)
+        node, X, e_j, rho_ij = problem.nodes[j], mode.X[i, j].T, part.at[j + 1], float(rho[i, j])
+        matrix.add(w, last, X, factor=-rho_ij, left=_mean_D(node).T)
+        matrix.add(e_j, last, X, factor=-rho_ij * node.arrival_probability, left=node.C.T)
+        if (i, j) not in mode.Y:
+            continue
+        Y = mode.Y[i, j].T
+        matrix.add(e_j, last, Y, factor=rho_ij)
+        if problem.unbiased:
+            matrix.add(e_i, last, Y, factor=-rho_ij)  # -Y_ij of Y_ii, (1 - rho_ij) Y_ij of messages that are lost
+        else:
+            matrix.add(x, last, Y, factor=-1.0)
+            if rho_ij < 1.0:
+                matrix.add(e_i, last, Y, factor=1.0 - rho_ij)
     return NodePart(matrix, part.rows(vertices), last, S)
 
 
-def _link(
+def _loss(
     build: Assembly, problem: Problem, mode: Mode, link: Link, Q_bar: list[tuple[float, Indices]], piece: Piece
 ) -> None:
-    """[T_ij, X_ij'; X_ij, Q_bar_i] >= 0, and -alpha_j C_j'T_ij C_j on x in the balance."""
-    node, matrix = problem.nodes[link[1]], build.inequality()
+    """[T_ij, X_ij'; X_ij, Q_bar_i] >= 0, and -alpha_j rho_ij r_j'T_ij r_j in the balance."""
+    node, matrix, nw = problem.nodes[link[1]], build.inequality(), problem.nw
     beta, C = node.arrival_probability, node.C
     T = build.symmetric(len(C))
     y, last = matrix.append(len(C)), matrix.append(problem.nx)
@@ -228,9 +255,37 @@ def _link(
     matrix.add(y, last, mode.X[link].T)
     for weight, Q_i in Q_bar:
         matrix.add(last, last, Q_i, factor=weight)
-    x = piece.at[0][: problem.nx]
-    piece.matrix.add(x, x, T, factor=-beta * (1.0 - beta), left=C.T, right=C)
-    mode.T[link], mode.links[link] = T, matrix
+    x, w = piece.at[0][:-nw], piece.at[0][-nw:]
+    rows, r = (np.concatenate([w, piece.at[link[1] + 1]]), np.hstack([node.D, C])) if node.seen else (x, C)
+    factor = -beta * (1.0 - beta) * float(problem.delivery[link])
+    piece.matrix.add(rows, rows, T, factor=factor, left=r.T, right=r)
+    mode.T[link], mode.losses[link] = T, matrix
+
+
+def _link(
+    build: Assembly, problem: Problem, mode: Mode, link: Link, Q_bar: list[tuple[float, Indices]], piece: Piece
+) -> None:
+    """[U_ij, V_ij'; V_ij, Q_bar_i] >= 0, and -rho_ij (1 - rho_ij) U_ij in the balance."""
+    (i, j), matrix, nx, nw = link, build.inequality(), problem.nx, problem.nw
+    node, rho, X, Y = problem.nodes[j], float(problem.delivery[link]), mode.X[link].T, mode.Y[link].T
+    U = build.symmetric(2 * nx + nw)
+    e_i, e_j, w, last = (matrix.append(size) for size in (nx, nx, nw, nx))
+    rows = np.concatenate([e_i, e_j, w])
+    matrix.add(rows, rows, U)
+    matrix.add(e_i, last, Y, factor=-1.0)
+    matrix.add(e_j, last, Y)
+    matrix.add(e_j, last, X, factor=-node.arrival_probability, left=node.C.T)
+    matrix.add(w, last, X, factor=-1.0, left=_mean_D(node).T)
+    for weight, Q_i in Q_bar:
+        matrix.add(last, last, Q_i, factor=weight)
+    rows = np.concatenate([piece.at[i + 1], piece.at[j + 1], piece.at[0][-nw:]])
+    piece.matrix.add(rows, rows, U, factor=-rho * (1.0 - rho))
+    mode.U[link], mode.links[link] = U, matrix
+
+
+def _mean_D(node: Node) -> Array:
+    """Dm_j of this module's first lines: the mean of what arrives of D_j w."""
+    return node.arrival_probability * node.D if node.seen else node.D
 
 
 def _peak(build: Assembly, problem: Problem, Q: Indices, delta: Indices) -> Inequality:
@@ -251,14 +306,21 @@ def _solution(problem: Problem, lmi: Lmi, u: Array, units: Units, record: Solver
     Y = np.zeros((len(lmi.modes), n * nx, n * nx))
     both = 1.0 / np.outer(units.state, units.state)
     for s, mode in enumerate(lmi.modes):
-        for i, j in mode.X:
-            rows = slice(i * nx, (i + 1) * nx)
-            X[s, rows, columns[j]] = u[mode.X[i, j]] / units.state[:, None]
-            Y[s, rows, j * nx : (j + 1) * nx] = both * u[mode.Y[i, j]]
+        for (i, j), X_ij in mode.X.items():
+            X[s, i * nx : (i + 1) * nx, columns[j]] = u[X_ij] / units.state[:, None]
+        for (i, j), Y_ij in mode.Y.items():
+            Y[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx] = both * u[Y_ij]
+    Q = both * np.array([[u[Q_i] for Q_i in mode.Q] for mode in lmi.modes])
+    if problem.unbiased:
+        Q_bar = np.tensordot(problem.markov.transition, Q, axes=1)
+        others = Y.reshape(len(Y), n, nx, n, nx).sum(axis=3)
+        for i in range(n):
+            part = slice(i * nx, (i + 1) * nx)
+            Y[:, part, part] = Q_bar[:, i] @ problem.plant.A - others[:, i]
     return LmiSolution(
         gamma=units.output * math.sqrt(max(float(u[lmi.delta].item()), 0.0)),
-        R=both * u[lmi.R],
-        Q=both * np.array([[u[Q_i] for Q_i in mode.Q] for mode in lmi.modes]),
+        R=both * u[lmi.R] if lmi.R.size else np.zeros((0, 0)),
+        Q=Q,
         X=X,
         Y=Y,
         solver=record,

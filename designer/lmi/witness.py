@@ -1,4 +1,4 @@
-"""The decomposed LMI written once more, with cvxpy and in the letters of theory.md: the witness for decomposed.py.
+"""The decomposed LMI written once more, with cvxpy and in the letters of docs/decomposed.md: the witness.
 
 The balance is one large matrix here, and every node has its S_i. Slower by far, and independent of the cone data.
 """
@@ -21,9 +21,11 @@ class WitnessMode(NamedTuple):
     Q: list[Any]  # Q_i, (nx, nx)
     X: dict[Link, Any]  # (nx, ny_j)
     Y: dict[Link, Any]  # (nx, nx)
-    S: list[Any]  # over (x, w, e_N)
+    S: list[Any]  # over (x, w, e_N); over (w, e_N) where the gains have to be unbiased
     T: dict[Link, Any]  # (ny_j, ny_j), where alpha_j > 0
+    U: dict[Link, Any]  # over (e_i, e_j, w), where rho_ij < 1
     nodes: list[Any]
+    losses: dict[Link, Any]
     links: dict[Link, Any]
     balance: Any
     peaks: list[Any]
@@ -41,49 +43,75 @@ class Witness(NamedTuple):
 def witness(problem: Problem) -> Witness:
     """The whole problem."""
     nx, n = problem.nx, problem.n
-    delta, R = cp.Variable(nonneg=True), cp.Variable((nx, nx), symmetric=True)
+    delta = cp.Variable(nonneg=True)
+    R = cp.Variable((nx, nx), symmetric=True) if problem.carries_plant else None
     Q = [[cp.Variable((nx, nx), symmetric=True) for _ in range(n)] for _ in problem.topologies]
     modes = [_mode(problem, s, delta, R, Q) for s in range(len(Q))]
-    constraints = [
-        matrix >> 0 for mode in modes for matrix in (*mode.nodes, *mode.links.values(), mode.balance, *mode.peaks)
+    matrices = [
+        matrix
+        for mode in modes
+        for matrix in (*mode.nodes, *mode.losses.values(), *mode.links.values(), mode.balance, *mode.peaks)
     ]
-    return Witness(delta, R, modes, cp.Problem(cp.Minimize(delta), [R >> 0, *constraints]))
+    constraints = [matrix >> 0 for matrix in (*matrices, *([] if R is None else [R]))]
+    return Witness(delta, R, modes, cp.Problem(cp.Minimize(delta), constraints))
 
 
 def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> WitnessMode:
     plant, nx, nw, n = problem.plant, problem.nx, problem.nw, problem.n
-    beta, C, D = problem.beta, [node.C for node in problem.nodes], [node.D for node in problem.nodes]
+    beta, rho = problem.beta, problem.delivery
+    C, D = [node.C for node in problem.nodes], [node.D for node in problem.nodes]
+    Dm = [beta[j] * D[j] if problem.nodes[j].seen else D[j] for j in range(n)]
     N = [problem.neighbours(s, i) for i in range(n)]
     links = [(i, j) for i in range(n) for j in N[i]]
-    X = {(i, j): cp.Variable((nx, len(C[j]))) for i, j in links}
-    Y = {link: cp.Variable((nx, nx)) for link in links}
-    S = [_symmetric(nx + nw + nx * len(N[i])) for i in range(n)]
-    T = {(i, j): _symmetric(len(C[j])) for i, j in links if beta[j] < 1.0}
     Q_bar = [sum(weight * Q[t][i] for t, weight in enumerate(problem.markov.transition[s])) for i in range(n)]
+    X = {(i, j): cp.Variable((nx, len(C[j]))) for i, j in links}
+    Y = {(i, j): cp.Variable((nx, nx)) for i, j in links if i != j or not problem.unbiased}
+    all_Y = dict(Y)
+    if problem.unbiased:
+        for i in range(n):
+            all_Y[i, i] = Q_bar[i] @ plant.A - sum(Y[i, j] for j in N[i] if j != i)
 
-    nodes = []
-    for i in range(n):
-        G_x = Q_bar[i] @ plant.A - sum(Y[i, j] for j in N[i])
-        G_w = Q_bar[i] @ plant.B - sum(X[i, j] @ D[j] for j in N[i])
-        G_e = [Y[i, j] - beta[j] * X[i, j] @ C[j] for j in N[i]]
-        G = cp.hstack([G_x, G_w, *G_e])
-        nodes.append(cp.bmat([[S[i], G.T], [G, Q_bar[i]]]))
-    link_matrices = {(i, j): cp.bmat([[T_ij, X[i, j].T], [X[i, j], Q_bar[i]]]) for (i, j), T_ij in T.items()}
+    p = nx if problem.carries_plant else 0
+    rows = np.eye(p + nw + n * nx)  # row k picks entry k of (x, w, e)
+    x, w = rows[:p], rows[p : p + nw]
+    e = [rows[p + nw + i * nx :][:nx] for i in range(n)]
+    balance = w.T @ w
+    if p:
+        A_B = plant.A @ x + plant.B @ w
+        balance = balance + x.T @ R @ x - A_B.T @ R @ A_B
 
-    rows = np.eye(nx + nw + n * nx)  # row k picks entry k of (x, w, e)
-    xw, x = rows[: nx + nw], rows[:nx]
-    e = [rows[nx + nw + i * nx :][:nx] for i in range(n)]
-    A_B = np.hstack([plant.A, plant.B])
-    balance = x.T @ R @ x + rows[nx : nx + nw].T @ rows[nx : nx + nw] - (A_B @ xw).T @ R @ (A_B @ xw)
+    nodes, S = [], []
     for i in range(n):
-        embed = np.vstack([xw, *(e[j] for j in N[i])])
+        G = {"w": Q_bar[i] @ plant.B - sum(rho[i, j] * X[i, j] @ Dm[j] for j in N[i])}
+        if not problem.unbiased:
+            G = {"x": Q_bar[i] @ plant.A - sum(all_Y[i, j] for j in N[i]), **G}
+        for j in N[i]:
+            on_e_j = rho[i, j] * (all_Y[i, j] - beta[j] * X[i, j] @ C[j])
+            own = sum((1.0 - rho[i, k]) * all_Y[i, k] for k in N[i]) if j == i else 0.0
+            G[f"e_{j}"] = on_e_j + own
+        picks = {"x": x, "w": w, **{f"e_{j}": e[j] for j in N[i]}}
+        embed, G_i = np.vstack([picks[name] for name in G]), cp.hstack(list(G.values()))
+        S.append(_symmetric(len(embed)))
+        nodes.append(cp.bmat([[S[i], G_i.T], [G_i, Q_bar[i]]]))
         balance = balance + e[i].T @ Q[s][i] @ e[i] - embed.T @ S[i] @ embed
-    for (_, j), T_ij in T.items():
-        balance = balance - beta[j] * (1.0 - beta[j]) * (C[j] @ x).T @ T_ij @ (C[j] @ x)
+
+    T, losses, U, link_matrices = {}, {}, {}, {}
+    for i, j in links:
+        if beta[j] < 1.0:
+            T[i, j] = _symmetric(len(C[j]))
+            losses[i, j] = cp.bmat([[T[i, j], X[i, j].T], [X[i, j], Q_bar[i]]])
+            r_j = C[j] @ e[j] + D[j] @ w if problem.nodes[j].seen else C[j] @ x
+            balance = balance - beta[j] * (1.0 - beta[j]) * rho[i, j] * r_j.T @ T[i, j] @ r_j
+        if rho[i, j] < 1.0:
+            U[i, j] = _symmetric(2 * nx + nw)
+            V_ij = cp.hstack([-Y[i, j], Y[i, j] - beta[j] * X[i, j] @ C[j], -X[i, j] @ Dm[j]])
+            link_matrices[i, j] = cp.bmat([[U[i, j], V_ij.T], [V_ij, Q_bar[i]]])
+            embed = np.vstack([e[i], e[j], w])
+            balance = balance - rho[i, j] * (1.0 - rho[i, j]) * embed.T @ U[i, j] @ embed
 
     M, nz = plant.M, problem.nz
     peaks = [cp.bmat([[Q_i, M.T], [M, delta * np.eye(nz)]]) for Q_i in Q[s]]
-    return WitnessMode(Q[s], X, Y, S, T, nodes, link_matrices, balance, peaks)
+    return WitnessMode(Q[s], X, Y, S, T, U, nodes, losses, link_matrices, balance, peaks)
 
 
 def _symmetric(order: int) -> Any:
