@@ -77,11 +77,11 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     starts = {f"consensus {weight}": consensus_gains(problem, weight=weight) for weight in _CONSENSUS_WEIGHTS}
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None
-    from designer.lmi import theorem2  # cvxpy takes seconds to import
+    from designer.lmi import beyond_paper, decomposed, theorem2  # cvxpy takes seconds to import
     from designer.synthesis import recover
 
     try:
-        solution = theorem2.solve(problem, reduced=True)
+        solution = decomposed.solve(problem) if beyond_paper(problem) else theorem2.solve(problem, reduced=True)
         gains = recover(problem, solution)
     except Unattainable:
         return starts, None  # one start less

@@ -8,9 +8,9 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 import pytest
-from networks import random_gains, random_problem
+from networks import random_gains, random_problem, real_network
 
-from agent.contract.errors import Unattainable
+from agent.contract.errors import InputError, Unattainable
 from agent.contract.problem import Problem
 from designer.back_off import plant_lyapunov
 from designer.certificate import inequality_17
@@ -222,3 +222,26 @@ def test_an_infeasible_lmi_is_said_to_be_infeasible(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(theorem2, "theorem2", contradictory)
     with pytest.raises(Unattainable, match=r"infeasible for two-nodes, says CLARABEL;.*try"):
         theorem2.solve(find("two-nodes"))
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        ({"seen": ["n1"]}, 'node "n1" sees its losses'),
+        ({"delivery": 0.9}, r'the link from "n\d" to "n\d" loses messages'),
+        ({"unbiased": True}, "the gains have to be unbiased"),
+    ],
+)
+@pytest.mark.parametrize("reduced", [False, True])
+def test_what_is_not_in_the_paper_is_refused(part: dict[str, Any], says: str, reduced: bool) -> None:
+    """One sentence: which part, and which method instead. What never happens is no such part."""
+    with pytest.raises(InputError, match=rf"the paper does not know that {says}, .*random-1; use --method decomposed"):
+        theorem2.solve(real_network(random_problem(1), **part), reduced=reduced)
+
+
+def test_what_never_happens_is_not_refused() -> None:
+    """beta = 1 where the node sees, and rho = 1, are the paper's problem."""
+    problem = random_problem(12, n=2, modes=1, lossy=False)
+    same = real_network(problem, seen=True, delivery=1.0)
+    gamma = theorem2.solve(problem, reduced=True).gamma
+    assert theorem2.solve(same, reduced=True).gamma == pytest.approx(gamma, rel=1e-12)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Solver
+from agent.contract.problem import Problem
 
 
 class LmiSolution(NamedTuple):
@@ -17,3 +18,14 @@ class LmiSolution(NamedTuple):
     X: Array  # (modes, n nx, sum ny): X^s = Q_bar(s) H_bar^s
     Y: Array  # (modes, n nx, n nx): Y^s = Q_bar(s) K_bar^s
     solver: Solver
+
+
+def beyond_paper(problem: Problem) -> str | None:
+    """The first part of the problem that Theorem 2 does not know, in words; None: it is the paper's problem."""
+    for node in problem.nodes:
+        if node.seen and node.arrival_probability < 1.0:
+            return f'node "{node.name}" sees its losses'
+    for link in problem.links or ():
+        if link.delivery_probability < 1.0:
+            return f'the link from "{link.sender}" to "{link.receiver}" loses messages'
+    return "the gains have to be unbiased" if problem.unbiased else None

@@ -19,11 +19,11 @@ import cvxpy as cp
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import Unattainable
+from agent.contract.errors import InputError, Unattainable
 from agent.contract.gains import Solver
 from agent.contract.problem import Problem
 from designer.error_model import Stacks, stacks
-from designer.lmi import LmiSolution
+from designer.lmi import LmiSolution, beyond_paper
 from designer.lmi.units import Units, natural_units, rescaled
 
 _OPTIONS: dict[str, dict[str, Any]] = {
@@ -48,8 +48,15 @@ def solve(problem: Problem, *, reduced: bool = False) -> LmiSolution:
     """Minimise gamma^2 subject to (36) and (37) for every mode.
 
     Clarabel first; if it gives no answer, Clarabel on rescaled data, then SCS where it is installed. What
-    failed on the way stands in `solver.status`. Raises Unattainable: infeasible, or no solver had an answer.
+    failed on the way stands in `solver.status`. Raises Unattainable: infeasible, or no solver had an answer;
+    InputError: the problem has a part that is not in the paper.
     """
+    part = beyond_paper(problem)
+    if part is not None:
+        raise InputError(
+            f"Theorem 2 is the paper's, and the paper does not know that {part}, as it is in {problem.name}; "
+            "use --method decomposed, or --method exact"
+        )
     attempts = [(cp.CLARABEL, ""), (cp.CLARABEL, " on rescaled data"), (cp.SCS, " on rescaled data")]
     failures: list[str] = []
     for solver, remark in attempts:
