@@ -6,7 +6,7 @@ The ladder: floor <= exact gain <= certified gamma <= Theorem 2's gamma, where t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -29,16 +29,26 @@ _LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains 
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
 
-def design_exact(problem: Problem, *, progress: Callable[[Progress], None] | None = None) -> Gains:
-    """Gains with the least exact gain that is found. KeyboardInterrupt ends the search; the best so far is returned."""
+def design_exact(
+    problem: Problem,
+    *,
+    starts: Mapping[str, StackedGains] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Gains:
+    """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
+
+    KeyboardInterrupt ends the search; the best so far is returned.
+    """
     started = time.perf_counter()
-    starts, lmi_gamma = _starts(problem)
+    starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
+    lmi_exact = exact_bounds(problem, *starts["theorem2"]) if "theorem2" in starts else None
     begun = time.perf_counter()
     descent = descend(problem, starts, progress=progress)
     solved = time.perf_counter()
     chosen = descent.chosen
     K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
-    certificate = _certificate(problem, *stacked_links(problem, K, H), lmi_gamma=lmi_gamma)
+    certificate = certify(problem, *stacked_links(problem, K, H))
+    certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
         problem=problem,
@@ -67,9 +77,14 @@ def with_ladder(problem: Problem, K: LinkMatrices, H: LinkMatrices, certificate:
     """The certificate with the exact gain of the gains, unless the network is large, and the floor."""
     exact = None
     if problem.n * problem.nx <= _LADDER_STATES:
-        gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
-        exact = (gain.low, gain.high) if gain.stable else None
+        exact = exact_bounds(problem, *stacked_links(problem, K, H))
     return certificate.model_copy(update={"exact": exact, "floor": floor(problem)})
+
+
+def exact_bounds(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[float, float] | None:
+    """The interval that the exact gain lies in; None where the errors are not mean-square stable."""
+    gain = exact_gain(error_model(problem, K_bar, H_bar))
+    return (gain.low, gain.high) if gain.stable else None
 
 
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
@@ -90,18 +105,18 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     return starts, solution.gamma
 
 
-def _certificate(problem: Problem, K_bar: Array, H_bar: Array, *, lmi_gamma: float | None) -> Certificate:
-    """gamma just above the exact gain, as the check confirms it; or Unattainable."""
+def certify(problem: Problem, K_bar: Array, H_bar: Array) -> Certificate:
+    """gamma just above the exact gain of any gains, as the check confirms it; or Unattainable."""
     gain = exact_gain(error_model(problem, K_bar, H_bar))
     if gain.P is None:
         raise Unattainable(
-            f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
-            f"{gain.radius:.6g} in each step; try --method theorem2"
+            f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
+            "in each step; peakmesh design PROBLEM --method theorem2 gives stable ones"
         )
     verdict = _confirmed(problem, K_bar, H_bar, gain, gain.P)
     if not verdict.holds:
         raise Unattainable(
-            f"the exact gain {gain.high:.6g} of the gains found for {problem.name} is not confirmed by the check "
+            f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
             f"({verdict.failure}); try the problem in other units, so that its numbers are near 1"
         )
     return Certificate(
@@ -110,7 +125,6 @@ def _certificate(problem: Problem, K_bar: Array, H_bar: Array, *, lmi_gamma: flo
         form="full",
         P=dict(zip(problem.mode_names, gain.P, strict=True)),
         horizon=gain.horizon,
-        lmi_gamma=lmi_gamma,
         exact=(gain.low, gain.high),
         floor=floor(problem),
         holds=verdict.holds,

@@ -16,6 +16,7 @@ from agent.contract.problem import Problem
 from designer.back_off import Confirmed, back_off, positive
 from designer.certificate import check, least_gamma
 from designer.descent import Progress
+from designer.effort import default_method
 from designer.error_model import link_gains, stacked_links, stacks
 from designer.exact_design import design_exact, with_ladder
 from designer.inwards import inwards
@@ -31,12 +32,16 @@ class Designed(NamedTuple):
     confirmed: Confirmed
 
 
-def design(problem: Problem, *, method: str = "theorem2", progress: Callable[[Progress], None] | None = None) -> Gains:
+def design(
+    problem: Problem, *, method: str | None = None, progress: Callable[[Progress], None] | None = None
+) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
+    The default method is "exact" where that takes at most about ten minutes, else "decomposed".
     `progress` is called during the method "exact" only, which also returns its best gains on KeyboardInterrupt.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found.
     """
+    method = default_method(problem) if method is None else method
     if method not in METHODS and method != EXACT:
         raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
     if not problem.plant.M.any():

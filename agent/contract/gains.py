@@ -47,6 +47,7 @@ class Certificate(Model):
     P: dict[str, Matrix] | None = None  # full: P[mode]
     horizon: int | None = None  # of the exact gain
     lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
+    lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
     floor: Number | None = None
     holds: bool = Field(strict=True)
@@ -130,26 +131,30 @@ class Gains(Model):
 
     @model_validator(mode="after")
     def _check_links(self) -> Self:
-        problem = self.problem
-        for letter, gains in (("K", self.K), ("H", self.H)):
-            _same_names(letter, gains, problem.mode_names, "modes")
-            for s, mode in enumerate(problem.mode_names):
-                _same_names(f'{letter}: mode "{mode}"', gains[mode], problem.node_names, "nodes")
-                for i, receiver in enumerate(problem.node_names):
-                    where = f'{letter}: mode "{mode}": node "{receiver}"'
-                    neighbours = problem.neighbours(s, i)
-                    heard = tuple(problem.node_names[j] for j in neighbours)
-                    _same_names(where, gains[mode][receiver], heard, "nodes that it hears in this mode")
-                    for j, sender in zip(neighbours, heard, strict=True):
-                        columns = problem.nx if letter == "K" else problem.nodes[j].C.shape[0]
-                        gain = gains[mode][receiver][sender]
-                        if gain.shape != (problem.nx, columns):
-                            raise ValueError(
-                                f'{where}: from "{sender}" is {shape_text(gain)}; it must be {problem.nx} x {columns}'
-                            )
-        if problem.unbiased:
-            _refuse_bias(problem, self.K)
+        check_links(self.problem, self.K, self.H)
         return self
+
+
+def check_links(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
+    """Raise ValueError unless there is a gain of the right shape for every link of the problem, and for no other."""
+    for letter, gains in (("K", K), ("H", H)):
+        _same_names(letter, gains, problem.mode_names, "modes")
+        for s, mode in enumerate(problem.mode_names):
+            _same_names(f'{letter}: mode "{mode}"', gains[mode], problem.node_names, "nodes")
+            for i, receiver in enumerate(problem.node_names):
+                where = f'{letter}: mode "{mode}": node "{receiver}"'
+                neighbours = problem.neighbours(s, i)
+                heard = tuple(problem.node_names[j] for j in neighbours)
+                _same_names(where, gains[mode][receiver], heard, "nodes that it hears in this mode")
+                for j, sender in zip(neighbours, heard, strict=True):
+                    columns = problem.nx if letter == "K" else problem.nodes[j].C.shape[0]
+                    gain = gains[mode][receiver][sender]
+                    if gain.shape != (problem.nx, columns):
+                        raise ValueError(
+                            f'{where}: from "{sender}" is {shape_text(gain)}; it must be {problem.nx} x {columns}'
+                        )
+    if problem.unbiased:
+        _refuse_bias(problem, K)
 
 
 def _refuse_bias(problem: Problem, K: LinkMatrices) -> None:

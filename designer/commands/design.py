@@ -1,4 +1,4 @@
-"""`peakmesh design`: gains with a certificate, and what to say of them."""
+"""`peakmesh design`: gains with a certificate, for a problem or for what is left of it; and what each part is worth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import agent.cli
-from agent.contract.errors import EXIT_GOOD
+from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
 
@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from designer.descent import Progress
 
 METHODS = (
-    "theorem2 (the default): the LMI of Zhu et al. 2020; theorem2-reduced: the same for [x; e], faster; "
-    "decomposed: the same optimum node by node, for large networks; exact: the least exact gain that descent finds"
+    "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
+    "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster "
+    "(default: exact where it takes at most about ten minutes, else decomposed)"
 )
 
 
@@ -30,27 +31,69 @@ def add_design(commands: agent.cli.Subcommands) -> None:
     design = agent.cli.add_command(commands, "design", design_command, "gains with a certificate, for a problem")
     design.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
     design.add_argument("-o", "--output", type=Path, metavar="FILE", help="gains file (<problem>.gains.json)")
-    design.add_argument("--method", default="theorem2", metavar="NAME", help=METHODS)
+    add_method(design)
+    design.add_argument(
+        "--without-node", action="append", default=[], metavar="N", help="leave node N out; may be repeated"
+    )
+    design.add_argument(
+        "--without-link",
+        action="append",
+        default=[],
+        metavar="A:B",
+        help="node A no longer hears node B, in any mode; may be repeated, B:A for the other direction",
+    )
+    design.add_argument(
+        "--price",
+        action="store_true",
+        help="no gains, but a table: the certified gamma with each node and each link left out in turn",
+    )
+    design.add_argument("--dask", metavar="ADDRESS", help="with --price: the designs run on this Dask cluster")
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     design.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def add_method(parser: argparse.ArgumentParser) -> None:
+    """Add the option of every command that designs."""
+    parser.add_argument("--method", metavar="NAME", help=METHODS)
 
 
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
     from designer.problems import find
 
-    _, result = design_and_save(find(options.problem), options.method, options.output, force=options.force)
+    problem = _what_is_left(find(options.problem), options.without_node, options.without_link)
+    if options.price:
+        return _price_command(problem, options)
+    if options.dask is not None:
+        raise InputError("--dask spreads the many designs of --price; a single design runs here")
+    _, result = design_and_save(problem, options.method, options.output, force=options.force)
     print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
 
 
-def design_and_save(problem: Problem, method: str, output: Path | None, *, force: bool) -> tuple[Gains, dict[str, Any]]:
-    """Design gains and save them; returns them and the facts to print."""
+def _what_is_left(problem: Problem, nodes: list[str], links: list[str]) -> Problem:
+    from designer.what_if import without_link, without_node
+
+    for link in links:
+        receiver, colon, sender = link.partition(":")
+        if not (receiver and colon and sender):
+            raise InputError(f"--without-link {link}: a link is A:B, two nodes of which A hears B")
+        problem = without_link(problem, receiver, sender)
+    for name in nodes:
+        problem = without_node(problem, name)
+    return problem
+
+
+def design_and_save(
+    problem: Problem, method: str | None, output: Path | None, *, force: bool
+) -> tuple[Gains, dict[str, Any]]:
+    """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
+    from designer.ladder import ladder_of
     from designer.synthesis import design  # only now: it loads a solver
 
-    gains = design(problem, method=method, progress=_descent_progress())
+    gains = design(problem, method=method or _chosen_method(problem), progress=_descent_progress())
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {
@@ -60,6 +103,7 @@ def design_and_save(problem: Problem, method: str, output: Path | None, *, force
         "lmi_gamma": proved.lmi_gamma,
         "exact": proved.exact,
         "floor": proved.floor,
+        "ladder": ladder_of(proved).document(),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
@@ -67,17 +111,36 @@ def design_and_save(problem: Problem, method: str, output: Path | None, *, force
     }
 
 
+def _chosen_method(problem: Problem) -> str:
+    """The default for this problem; on stderr why, where it is not the best one or takes long."""
+    from designer.effort import LONG, default_method, in_words, seconds_of_exact
+
+    method, seconds = default_method(problem), seconds_of_exact(problem)
+    if method != "exact":
+        print(
+            f"method {method}: exact would take about {in_words(seconds)} here; --method exact asks for it",
+            file=sys.stderr,
+        )
+    elif seconds > LONG:
+        print(
+            f"method exact: it takes about {in_words(seconds)} here; --method decomposed is faster", file=sys.stderr
+        )
+    return method
+
+
 def design_text(result: dict[str, Any]) -> str:
     """The facts of a design, for people."""
-    solver, exact = result["solver"], result["exact"]
-    lmi = "" if result["lmi_gamma"] is None else f" (the solver's value of the LMI {result['lmi_gamma']:.6f})"
-    ladder = [f"floor {result['floor']:.6f}"] if result["floor"] is not None else []
-    ladder += [f"what these gains really have {exact[1]:.6f}"] if exact is not None else []
+    from designer.ladder import Ladder
+
+    solver = result["solver"]
+    rungs = {name: result["ladder"][name] for name in Ladder._fields}
+    ladder = "\n           ".join(Ladder(**rungs).lines())
     return (
-        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified{lmi}\n"
-        f"ladder     {' <= '.join([*ladder, 'gamma'])}\n"
-        f"{solver['name']} {solver['version']}: {solver['status']}, {solver['iterations']} iterations; "
+        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified\n"
+        f"ladder     {ladder}\n"
+        f"solver     {solver['name']} {solver['version']}: {solver['iterations']} iterations, "
         f"{result['seconds']['total']:.1f} s in all\n"
+        f"status     {solver['status']}\n"
         f"gains      {result['output']}\n"
         f"next       peakmesh run {result['output']}"
     )
@@ -98,3 +161,19 @@ def _descent_progress() -> Callable[[Progress], None]:
             )
 
     return show
+
+
+def _price_command(problem: Problem, options: argparse.Namespace) -> int:
+    """`peakmesh design PROBLEM --price`."""
+    from designer.what_if import price, price_method, price_text
+
+    if options.output is not None:
+        raise InputError("--price writes no gains file; leave --output out, or --price")
+    method = options.method or price_method(problem)
+
+    def show(done: int, of: int, what: str) -> None:
+        print(f"{done:4d} of {of} designs, {what}", file=sys.stderr)
+
+    table = price(problem, method=method, dask=options.dask, report=show)
+    print(json.dumps(table.document()) if options.json else price_text(table))
+    return EXIT_GOOD

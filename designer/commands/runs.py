@@ -12,7 +12,7 @@ import agent.cli
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
-from designer.commands.design import design_and_save, design_text
+from designer.commands.design import add_method, design_and_save, design_text
 from designer.commands.recordings import write_pictures
 
 
@@ -22,6 +22,7 @@ def add_demo(commands: agent.cli.Subcommands) -> None:
         commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)"
     )
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
+    add_method(demo)
     agent.cli.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
 
 
@@ -39,7 +40,7 @@ def demo_command(options: argparse.Namespace) -> int:
     for path in (gains_path, options.output):
         refuse_overwrite(path, force=options.force)
 
-    gains, designed = design_and_save(problem, "theorem2", gains_path, force=options.force)
+    gains, designed = design_and_save(problem, options.method, gains_path, force=options.force)
     _say(options, f"1. design\n{design_text(designed)}")
     ran = agent.cli.run_gains(gains_path, gains, options)
     _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{agent.cli.run_text(ran)}")
@@ -62,6 +63,7 @@ def add_run(commands: agent.cli.Subcommands) -> None:
     """Describe `run` to the parser."""
     run = agent.cli.add_command(commands, "run", run_command, "run every role as a process on this machine")
     run.add_argument("gains", metavar="PROBLEM_OR_GAINS", help=f"gains file, {PROBLEM}")
+    add_method(run)
     agent.cli.add_run_options(run)
 
 
@@ -78,7 +80,7 @@ def run_command(options: argparse.Namespace) -> int:
         options.output = agent.cli.default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_overwrite(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
-    gains, _ = design_and_save(problem, "theorem2", path, force=options.force)
+    gains, _ = design_and_save(problem, options.method, path, force=options.force)
     print(f"designed {path}, gamma = {gains.certificate.gamma:.6f}", file=sys.stderr)
     result = {"gains": str(path), **agent.cli.run_gains(path, gains, options)}
     print(json.dumps(result) if options.json else f"{agent.cli.run_text(result)}\ngains      {path}")

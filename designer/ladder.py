@@ -1,0 +1,70 @@
+"""The ladder: floor <= exact gain <= certified gamma, and Theorem 2's bound beside them where it was computed.
+
+Every rung is a peak of the error per root of the energy of w. Theorem 2's bound lies above what its own gains really
+have: that is how loose the bound is. What lies below both is what better gains are worth.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from agent.contract.gains import Certificate
+
+_NOTHING = 1e-6  # a floor this small beside the gain says nothing
+
+
+class Ladder(NamedTuple):
+    """The rungs; None where one was not computed."""
+
+    floor: float | None
+    exact: tuple[float, float] | None  # the gain of these gains lies between
+    gamma: float | None  # certified
+    theorem2_exact: tuple[float, float] | None  # of Theorem 2's gains, where these are others
+    theorem2: float | None  # its bound, as the solver gave it
+
+    @property
+    def against_theorem2(self) -> float | None:
+        """The exact gain relative to Theorem 2's bound: -0.295 is 29.5 % below it."""
+        return None if self.exact is None or self.theorem2 is None else self.exact[1] / self.theorem2 - 1.0
+
+    @property
+    def above_floor(self) -> float | None:
+        """The exact gain, or else gamma, relative to the floor; None where the floor says nothing."""
+        value = self.gamma if self.exact is None else self.exact[1]
+        if value is None or self.floor is None or self.floor <= _NOTHING * value:
+            return None
+        return value / self.floor - 1.0
+
+    def document(self) -> dict[str, Any]:
+        """The rungs and both distances, for --json."""
+        return {**self._asdict(), "against_theorem2": self.against_theorem2, "above_floor": self.above_floor}
+
+    def lines(self) -> list[str]:
+        """A line for each rung, the lowest first."""
+        rungs = [
+            (self.floor, "floor"),
+            (self.exact and self.exact[1], "exact gain of these gains"),
+            (self.gamma, "gamma, certified"),
+            (self.theorem2_exact and self.theorem2_exact[1], "exact gain of Theorem 2's gains"),
+            (self.theorem2, "Theorem 2's bound"),
+        ]
+        remarks = []
+        if self.against_theorem2 is not None:
+            remarks.append(f"{percent(self.against_theorem2)} against Theorem 2's bound")
+        if self.above_floor is not None:
+            remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
+        at = 1 if self.exact is not None else 2
+        rungs[at] = rungs[at][0], ": ".join([rungs[at][1], *([", ".join(remarks)] if remarks else [])])
+        return [f"{value:.6f}  {name}" for value, name in rungs if value is not None]
+
+
+def ladder_of(certificate: Certificate) -> Ladder:
+    """The ladder of what a design or a file claims."""
+    gamma = certificate.gamma if certificate.holds else None
+    return Ladder(certificate.floor, certificate.exact, gamma, certificate.lmi_exact, certificate.lmi_gamma)
+
+
+def percent(part: float) -> str:
+    """ "-29.5 %", "+3.1 %", "0.0 %"."""
+    text = f"{100.0 * part:+.1f} %"
+    return text[1:] if text[1:] == "0.0 %" else text
