@@ -26,7 +26,7 @@ def seconds_of_exact(problem: Problem) -> float:
     modes, size = len(problem.topologies), (problem.n + 1) * problem.nx
     entries = Entries(problem)
     free = float(np.count_nonzero(entries.K) + np.count_nonzero(entries.H))
-    return 0.002 * modes * free**0.7 * size**1.4
+    return float(0.002 * modes * free**0.7 * size**1.4)
 
 
 def in_words(seconds: float) -> str:
@@ -34,4 +34,4 @@ def in_words(seconds: float) -> str:
     for unit, size in (("hours", 3600.0), ("minutes", 60.0)):
         if seconds >= 2.0 * size:
             return f"{seconds / size:.0f} {unit}"
-    return f"{max(seconds, 1.0):.0f} seconds"
+    return f"{max(seconds, 2.0):.0f} seconds"

@@ -32,9 +32,7 @@ class Designed(NamedTuple):
     confirmed: Confirmed
 
 
-def design(
-    problem: Problem, *, method: str | None = None, progress: Callable[[Progress], None] | None = None
-) -> Gains:
+def design(problem: Problem, *, method: str | None = None, progress: Callable[[Progress], None] | None = None) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
     The default method is "exact" where that takes at most about ten minutes, else "decomposed".

@@ -45,10 +45,8 @@ def without_link(problem: Problem, receiver: str, sender: str) -> Problem:
     if i == j:
         raise InputError(f"link {receiver}:{sender}: a node always hears itself; name two nodes, A:B where A hears B")
     if j not in problem.ever_heard(i):
-        heard = listed(problem.node_names[k] for k in problem.ever_heard(i) if k != i)
-        raise InputError(
-            f'link {receiver}:{sender}: node "{receiver}" hears "{sender}" in no mode; it hears {heard or "nobody else"}'
-        )
+        heard = listed(problem.node_names[k] for k in problem.ever_heard(i) if k != i) or "nobody else"
+        raise InputError(f'link {receiver}:{sender}: node "{receiver}" hears "{sender}" in no mode; it hears {heard}')
     document = problem.document()
     for topology in document["topology"]:
         topology["adjacency"][i][j] = 0.0

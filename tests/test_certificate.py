@@ -36,7 +36,7 @@ def gains() -> Gains:
 
 @pytest.fixture(scope="module")
 def structured() -> Gains:
-    return design(find("zhu2020-ideal"))
+    return design(find("zhu2020-ideal"), method="theorem2")
 
 
 def mutated(gains: Gains, mutate: Callable[[Document], None]) -> Gains:

@@ -32,6 +32,7 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     """A design can be verified and shown, and says the same facts as text and as JSON."""
     assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
     designed = json.loads(capsys.readouterr().out)
+    assert designed["method"] == "exact"  # the default for a problem this small
     promised = {"problem", "method", "gamma", "lmi_gamma", "exact", "floor", "holds", "seconds", "output"}
     assert promised <= designed.keys()
     assert designed["holds"] is True
@@ -44,7 +45,10 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert f"{designed['gamma']:.5f}"[:6] in capsys.readouterr().out
     assert run("design", "two-nodes", "-o", "gains.json") == 2
     assert "exists already" in capsys.readouterr().err
-    assert run("design", "two-nodes", "-o", "gains.json", "--force") == 0
+    assert run("design", "two-nodes", "-o", "gains.json", "--force", "--method", "decomposed") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("two-nodes by decomposed: gamma = 1.41421")
+    assert "ladder     1.414214  floor\n" in printed
 
 
 def test_show_lists_the_built_in_problems(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,7 +60,7 @@ def test_show_lists_the_built_in_problems(capsys: pytest.CaptureFixture[str]) ->
 
 def test_a_certificate_that_fails_is_an_answer(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
     """Verify says no with exit code 1 and why, where a gamma is too small."""
-    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    assert run("design", "two-nodes", "-o", "gains.json", "--method", "decomposed") == 0
     document = json.loads(Path("gains.json").read_text())
     document["certificate"]["gamma"] *= 1 - 1e-5
     Path("gains.json").write_text(json.dumps(document))
@@ -148,15 +152,27 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("design", "two-nodes", "--method", "magic", "-o", "never.json") == 2
     assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
     assert not Path("never.json").exists()
+    for words, sentence in {
+        ("--dask", "tcp://127.0.0.1:1"): "--dask spreads the many designs of --price",
+        ("--price", "-o", "never.json"): "--price writes no gains file",
+        ("--without-link", "left"): "--without-link left: a link is A:B",
+        ("--without-link", "left:left"): "a node always hears itself",
+        ("--without-link", "left:middle"): 'node "middle" does not exist',
+        ("--without-node", "middle"): 'node "middle" does not exist',
+        ("--without-node", "left", "--without-node", "right"): "is the only node of two-nodes-without-left",
+    }.items():
+        assert run("design", "two-nodes", *words) == 2
+        assert sentence in capsys.readouterr().err
 
 
 # The whole job, and what is kept of an old one.
 @pytest.mark.timeout(180)
 def test_demo(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One command designs, runs, replays and pictures the paper's second example; every file it names is there."""
-    assert run("demo", "--steps", "50", "--json") == 0
+    assert run("demo", "--steps", "50", "--json", "--method", "decomposed") == 0
     done = json.loads(capsys.readouterr().out)
     assert 0.34797 < done["design"]["gamma"] < 0.34801
+    assert done["design"]["ladder"]["exact"][1] < done["design"]["gamma"]
     assert done["replay"]["agrees"]
     assert done["replay"]["finished"]
     files = [done["design"]["output"], done["run"]["recording"], *done["pictures"]]

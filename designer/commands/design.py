@@ -122,9 +122,7 @@ def _chosen_method(problem: Problem) -> str:
             file=sys.stderr,
         )
     elif seconds > LONG:
-        print(
-            f"method exact: it takes about {in_words(seconds)} here; --method decomposed is faster", file=sys.stderr
-        )
+        print(f"method exact: it takes about {in_words(seconds)} here; --method decomposed is faster", file=sys.stderr)
     return method
 
 

@@ -71,6 +71,8 @@ def run_command(options: argparse.Namespace) -> int:
     """`peakmesh run PROBLEM_OR_GAINS`: a problem is designed first, its gains stand beside the recording."""
     path = Path(options.gains)
     if path.suffix == ".json" or (path.is_file() and path.suffix != ".toml"):
+        if options.method is not None:
+            raise InputError(f"--method says how to design a problem; {path} has its gains already")
         options.gains = path
         return agent.cli.run_command(options)
     from designer.problems import find

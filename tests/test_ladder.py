@@ -1,0 +1,53 @@
+"""The ladder, and the choice of the default method."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from benchmarks.design import banded
+from designer.effort import LONGEST, default_method, in_words, seconds_of_exact
+from designer.ladder import Ladder, percent
+from designer.problems import find, names
+
+
+def test_the_distances() -> None:
+    """Of the exact gain, below Theorem 2's bound and above the floor."""
+    ladder = Ladder(floor=2.0, exact=(2.19, 2.2), gamma=2.2, theorem2_exact=(3.0, 3.1), theorem2=4.0)
+    assert (ladder.against_theorem2, ladder.above_floor) == (2.2 / 4.0 - 1.0, 2.2 / 2.0 - 1.0)
+    assert ladder.lines() == [
+        "2.000000  floor",
+        "2.200000  exact gain of these gains: -45.0 % against Theorem 2's bound, 10.0 % above the floor",
+        "2.200000  gamma, certified",
+        "3.100000  exact gain of Theorem 2's gains",
+        "4.000000  Theorem 2's bound",
+    ]
+
+
+def test_what_is_not_there_is_not_said() -> None:
+    """No percentage above a floor of zero, and no rung that was not computed."""
+    assert Ladder(0.0, None, 1.0, None, None).lines() == ["0.000000  floor", "1.000000  gamma, certified"]
+    assert Ladder(0.5, None, 1.0, None, 1.0).lines()[1] == "1.000000  gamma, certified: 100.0 % above the floor"
+    assert Ladder(None, (0.9, 1.0), None, None, None).lines() == ["1.000000  exact gain of these gains"]
+    assert Ladder(1e-12, (0.9, 1.0), None, None, None).above_floor is None
+
+
+def test_percentages() -> None:
+    assert [percent(part) for part in (-0.2954, 0.031, 1e-9, -1e-9)] == ["-29.5 %", "+3.1 %", "0.0 %", "0.0 %"]
+
+
+def test_the_default_is_exact_up_to_ten_minutes() -> None:
+    """Every built-in problem is small; a hundred nodes are not; many designs of one problem are not either."""
+    assert {name: default_method(find(name)) for name in names()} == dict.fromkeys(names(), "exact")
+    large = banded(100)
+    assert seconds_of_exact(large) > LONGEST
+    assert default_method(large) == "decomposed"
+    assert default_method(find("zhu2020-lossy"), designs=1000.0) == "decomposed"
+
+
+def test_the_estimate_grows_with_the_network() -> None:
+    seconds = [seconds_of_exact(banded(n)) for n in (4, 8, 16, 32)]
+    assert all(3.0 < later / earlier < 8.0 for earlier, later in pairwise(seconds))
+
+
+def test_seconds_in_words() -> None:
+    assert [in_words(s) for s in (0.1, 40.0, 700.0, 7300.0)] == ["2 seconds", "40 seconds", "12 minutes", "2 hours"]
