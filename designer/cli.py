@@ -12,7 +12,7 @@ from importlib.metadata import version
 
 import agent.cli
 from agent.contract.errors import EXIT_INPUT
-from designer.commands import design, recordings, runs, show, verify
+from designer.commands import analyse, design, recordings, runs, show, verify
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     runs.add_demo(commands)
     design.add_design(commands)
+    analyse.add_analyse(commands)
     verify.add_verify(commands)
     runs.add_run(commands)
     recordings.add_replay(commands)

@@ -94,6 +94,7 @@ WRONG_FILES = {
 COMMANDS = {
     "design": ["design", "FILE", "-o", "out"],
     "demo": ["demo", "FILE", "-o", "out"],
+    "analyse": ["analyse", "two-nodes", "--gains", "FILE"],
     "verify": ["verify", "FILE"],
     "run": ["run", "FILE", "-o", "out"],
     "node": ["node", "FILE", "--node", "1", "--connect", "tcp/127.0.0.1:1"],
@@ -123,7 +124,7 @@ def test_wrong_file(folder: Path, capsys: pytest.CaptureFixture[str], command: s
     assert sorted(folder.iterdir()) == there
 
 
-@pytest.mark.parametrize("command", ["verify", "run", "node", "plant", "coordinator", "recorder", "show"])
+@pytest.mark.parametrize("command", ["analyse", "verify", "run", "node", "plant", "coordinator", "recorder", "show"])
 def test_edited_problem(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str], command: str) -> None:
     """Gains whose problem was edited afterwards are refused by every command that reads them."""
     document = json.loads(gains.canonical())

@@ -1,0 +1,207 @@
+"""What any gains do on a problem: the exact gain, the disturbances that attain it, and the ladder.
+
+The gains may be those of a gains file, which may have been designed for another problem of the same shape, or somebody
+else's in a plain JSON file: {"K": {mode: {i: {j: rows}}}, "H": the same}, where i receives from j, and the filter (5)
+multiplies K_ij and H_ij by a_ij. The problem that they are analysed on is the one that is given, not the file's.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from agent.contract.arrays import Array, Model
+from agent.contract.errors import InputError, first_fault
+from agent.contract.files import read_bytes
+from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
+from agent.contract.problem import Problem
+from designer.error_model import error_model, stacked_links
+from designer.exact_design import certify
+from designer.floor import floor
+from designer.gain import exact_gain
+from designer.ladder import Ladder
+from designer.worst_case import worst_disturbance, worst_policy
+
+_MOST_COLUMNS = 200  # of w over all steps, in the search for the worst w that is fixed beforehand
+
+
+class GivenGains(NamedTuple):
+    """Gains for the links of a problem, and where they come from."""
+
+    K: LinkMatrices
+    H: LinkMatrices
+    source: str
+    file: Gains | None  # the gains file; None for a plain JSON
+
+
+class _Plain(Model):
+    """A file with nothing but gains."""
+
+    K: LinkMatrices
+    H: LinkMatrices
+
+
+class Analysis(NamedTuple):
+    """The answer; where the errors are not mean-square stable, there is no gain and no worst disturbance."""
+
+    problem: Problem
+    given: GivenGains
+    stable: bool
+    radius: float  # what E|eta|^2 is multiplied by in each step, in the long run
+    horizon: int
+    ladder: Ladder
+    mode: str | None  # of the worst policy: where it begins
+    steps: int  # of the worst policy, from the first w to the peak
+    u: Array | None  # (nw,): its first w
+    fixed: float | None  # the gain to the worst w that is fixed beforehand, from r(0) = initial
+    fixed_within: int  # the steps that it was sought over
+    w: Array | None  # (at most fixed_within, nw), of energy 1
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the gains file was made for another problem."""
+        return self.given.file is not None and self.given.file.problem_digest != self.problem.digest()
+
+    def document(self) -> dict[str, Any]:
+        """For --json."""
+        return {
+            "problem": self.problem.name,
+            "gains": self.given.source,
+            "designed_for": None if self.given.file is None else self.given.file.problem.name,
+            "same_problem": None if self.given.file is None else not self.foreign,
+            "stable": self.stable,
+            "radius": self.radius,
+            "exact": self.ladder.exact,
+            "horizon": self.horizon,
+            "floor": self.ladder.floor,
+            "ladder": self.ladder.document(),
+            "worst_policy": None
+            if self.u is None
+            else {"mode": self.mode, "steps": self.steps, "first_w": self.u.tolist()},
+            "worst_fixed": None
+            if self.w is None
+            else {
+                "gain": self.fixed,
+                "initial_mode": self.problem.markov.initial,
+                "searched_steps": self.fixed_within,
+                "w": self.w.tolist(),
+            },
+        }
+
+    def text(self) -> str:
+        """The facts for people."""
+        problem, given = self.problem, self.given
+        lines = [f"{given.source} on {problem.name}"]
+        if self.foreign:
+            assert given.file is not None
+            lines.append(
+                f"designed for another problem, {given.file.problem.name} ({given.file.problem_digest[:12]}...), "
+                f"than the one here ({problem.digest()[:12]}...)"
+            )
+        if not self.stable:
+            lines.append(
+                f"NOT mean-square stable: in the long run each step multiplies E|error|^2 by {self.radius:.6g}; "
+                "no gamma bounds the error"
+            )
+            return "\n".join([*lines, f"ladder     {self.ladder.floor:.6f}  floor"])
+        assert self.ladder.exact is not None
+        assert self.u is not None
+        assert self.w is not None
+        low, high = self.ladder.exact
+        rungs = "\n           ".join(self.ladder.lines())
+        then = f", then w = Gamma [x; e] for {_steps(self.steps - 1)}" if self.steps > 1 else ""
+        if given.file is not None and given.file.certificate.holds and not self.foreign:
+            lines.append(f"claimed    gamma {given.file.certificate.gamma:.6f}; peakmesh verify checks it")
+        lines += [
+            f"stable     mean-square; each step multiplies E|error|^2 by {self.radius:.6g} in the long run",
+            f"exact gain between {low:.8g} and {high:.8g}, from {self.horizon} steps and a bound on the rest",
+            f"ladder     {rungs}",
+            f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
+            f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
+            f'           that is fixed beforehand: gain {self.fixed:.6f} from mode "{problem.markov.initial}" '
+            f"over {_steps(self.fixed_within)}",
+        ]
+        return "\n".join(lines)
+
+
+def load_given(path: Path, problem: Problem) -> GivenGains:
+    """Read gains for the links of `problem`. Raises InputError: one sentence for what does not fit."""
+    data = read_bytes(path, kind="gains file")
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError):
+        document = None
+    file = None
+    if isinstance(document, dict) and "format" not in document and {"K", "H"} & set(document):
+        try:
+            plain = _Plain.model_validate(document)
+        except ValidationError as error:
+            raise InputError(f"{path}: {first_fault(error, document)}") from None
+        K, H = plain.K, plain.H
+    elif isinstance(document, dict) and document.get("format") != FORMAT:
+        raise InputError(
+            f'{path} holds no gains: it is neither a gains file, which says "format": "{FORMAT}", nor a table of '
+            '"K" and "H", K[mode][i][j] for what node i does with the estimate of node j'
+        )
+    else:
+        file = Gains.from_bytes(data, source=str(path))
+        K, H = file.K, file.H
+    try:
+        check_links(problem, K, H)
+    except ValueError as error:
+        raise InputError(f"{path} does not fit {problem.name}: {error}") from None
+    return GivenGains(K, H, str(path), file)
+
+
+def analyse(problem: Problem, given: GivenGains) -> Analysis:
+    """The exact gain of the gains on the problem, and what attains it."""
+    model = error_model(problem, *stacked_links(problem, given.K, given.H))
+    gain = exact_gain(model)
+    exact = (gain.low, gain.high) if gain.stable else None
+    ladder = Ladder(floor(problem), exact, gamma=None, theorem2_exact=None, theorem2=None)
+    if not gain.stable:
+        return Analysis(problem, given, False, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
+    policy = worst_policy(model, horizon=gain.horizon)
+    within = min(gain.horizon, max(_MOST_COLUMNS // problem.nw, 1))
+    fixed = worst_disturbance(model, initial=problem.mode_index(problem.markov.initial), horizon=within)
+    return Analysis(
+        problem=problem,
+        given=given,
+        stable=True,
+        radius=gain.radius,
+        horizon=gain.horizon,
+        ladder=ladder,
+        mode=problem.mode_names[policy.mode],
+        steps=len(policy.Gamma) + 1,
+        u=policy.u * (-1.0 if policy.u[np.abs(policy.u).argmax()] < 0.0 else 1.0),
+        fixed=fixed.gain,
+        fixed_within=within,
+        w=fixed.w,
+    )
+
+
+def certified(problem: Problem, given: GivenGains) -> Gains:
+    """A gains file of the given gains, with a certificate of their exact gain; or Unattainable."""
+    certificate = certify(problem, *stacked_links(problem, given.K, given.H))
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method="given",
+        K=given.K,
+        H=given.H,
+        certificate=certificate,
+        solver=Solver(name="none", version="-", status="the gains were given", iterations=0, seconds=0.0),
+        seconds={"total": 0.0},
+    )
+
+
+def _vector(u: Array) -> str:
+    return "[" + ", ".join(f"{entry:.4g}" for entry in u) + "]"
+
+
+def _steps(number: int) -> str:
+    return "1 step" if number == 1 else f"{number} steps"

@@ -1,0 +1,48 @@
+"""`peakmesh analyse`: what any gains do on a problem."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import agent.cli
+from agent.contract.errors import EXIT_GOOD, EXIT_NO
+from agent.contract.files import refuse_overwrite
+from designer.commands import PROBLEM
+
+
+def add_analyse(commands: agent.cli.Subcommands) -> None:
+    """Describe `analyse` to the parser."""
+    analyse = agent.cli.add_command(
+        commands, "analyse", analyse_command, "the exact gain of any gains on a problem, and the worst disturbances"
+    )
+    analyse.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
+    analyse.add_argument(
+        "--gains", type=Path, required=True, metavar="FILE", help='gains file, or a plain JSON with "K" and "H" alone'
+    )
+    analyse.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="write them as a gains file, their exact gain certified"
+    )
+    analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
+    analyse.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def analyse_command(options: argparse.Namespace) -> int:
+    """`peakmesh analyse PROBLEM --gains FILE`: exit code 1 where the errors are not mean-square stable."""
+    from designer.analysis import analyse, certified, load_given
+    from designer.problems import find
+
+    problem = find(options.problem)
+    if options.output is not None:
+        refuse_overwrite(options.output, force=options.force)
+    given = load_given(options.gains, problem)
+    analysis = analyse(problem, given)
+    facts, text = analysis.document() | {"output": None}, analysis.text()
+    if options.output is not None and analysis.stable:
+        gains = certified(problem, given)
+        gains.save(options.output, force=options.force)
+        facts |= {"gamma": gains.certificate.gamma, "output": str(options.output)}
+        text += f"\ngains      {options.output}, gamma = {gains.certificate.gamma:.6f}, certified"
+    print(json.dumps(facts) if options.json else text)
+    return EXIT_GOOD if analysis.stable else EXIT_NO
