@@ -1,4 +1,7 @@
-"""One node's step: eqs. (4) and (5) of Zhu et al. 2020. Pure numpy; no clock, no chance, no network."""
+"""One node's step: eqs. (4) and (5) of Zhu et al. 2020. Pure numpy; no clock, no chance, no network.
+
+Not in the paper: a node that sees its losses, messages that do not arrive, and gains that are imposed to be unbiased.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +18,43 @@ class Pair(NamedTuple):
     """What a node tells the others at step k."""
 
     x_hat: Array  # x_hat_j(k), (nx,)
-    innovation: Array  # y_j(k) - beta_j C_j x_hat_j(k), (ny_j,)
+    innovation: Array  # nu_j(k), (ny_j,)
 
 
 def innovation(gains: NodeGains, y: Array, x_hat: Array) -> Array:
-    """The bracket of eq. (4): y_i(k) - beta_i C_i x_hat_i(k), (ny_i,)."""
-    return y - gains.arrival_probability * (gains.C @ x_hat)
+    """nu_i(k), (ny_i,): the bracket of eq. (4), y_i(k) - beta_i C_i x_hat_i(k).
+
+    A node that sees its losses knows whether the plant is in y_i(k): nu_i(k) = y_i(k) - C_i x_hat_i(k), and 0 where
+    nothing arrived, which is an empty `y`.
+    """
+    if not gains.seen:
+        return y - gains.arrival_probability * (gains.C @ x_hat)
+    return y - gains.C @ x_hat if len(y) else np.zeros(len(gains.C))
 
 
 def step(gains: NodeGains, mode: str, heard: Mapping[str, Pair]) -> Array:
-    """Eqs. (4)(5): x_hat_i(k+1) = sum over j in N_i of a_ij K_ij x_hat_j(k) + a_ij H_ij innovation_j(k), (nx,).
+    """Eqs. (4)(5): x_hat_i(k+1) = sum over j in N_i of a_ij (K_ij x_hat_j(k) + H_ij nu_j(k)), (nx,).
 
-    `heard` holds the pair of every node that node i hears in `mode`, its own among them.
+    `heard` holds the pairs that arrived, the node's own among them. For a neighbour j in `mode` whose pair did not,
+    x_hat_i(k) stands in for x_hat_j(k), and 0 for nu_j(k), so that the sum of the weights of estimates stays the same.
+
+    Unbiased gains, sum over j of a_ij K_ij = A: the step is the same, with a_ii K_ii taken from that equation,
+    x_hat_i(k+1) = A x_hat_i(k) + sum over j heard of a_ij (K_ij (x_hat_j(k) - x_hat_i(k)) + H_ij nu_j(k)). So an
+    unstable plant is followed exactly: the rounding of K_ii in a file is not multiplied by a state that grows.
     """
+    x_hat_i = heard[gains.node].x_hat
+    if gains.A is not None:
+        x_hat_next = gains.A @ x_hat_i
+        for j, a_ij, K_ij, H_ij in gains.links[mode]:
+            if j in heard:
+                x_hat_j, nu_j = heard[j]
+                x_hat_next += a_ij * (K_ij @ (x_hat_j - x_hat_i) + H_ij @ nu_j)
+        return x_hat_next
     x_hat_next = np.zeros(gains.M.shape[1])
     for j, a_ij, K_ij, H_ij in gains.links[mode]:
-        x_hat_j, innovation_j = heard[j]
-        x_hat_next += a_ij * (K_ij @ x_hat_j + H_ij @ innovation_j)
+        if j in heard:
+            x_hat_j, nu_j = heard[j]
+            x_hat_next += a_ij * (K_ij @ x_hat_j + H_ij @ nu_j)
+        else:
+            x_hat_next += a_ij * (K_ij @ x_hat_i)
     return x_hat_next

@@ -7,6 +7,7 @@ belongs to a finished step is dropped.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Container
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Inbox:
 
     def __init__(self, gains: NodeGains) -> None:
         self._hears = {mode: [link.sender for link in links] for mode, links in gains.links.items()}
-        self._ny = gains.C.shape[0]
+        self._ny, self._seen = gains.C.shape[0], gains.seen
         self._sizes = {  # of each sender's pair
             link.sender: (link.K.shape[1], link.H.shape[1]) for links in gains.links.values() for link in links
         }
@@ -41,7 +42,7 @@ class Inbox:
                     raise ValueError(f'mode "{mode}" does not exist; the gains have {listed(self._hears)}')
                 self._modes[step] = mode
             case Measurement(step=step, y=y):
-                if len(y) != self._ny:
+                if len(y) != self._ny and (y or not self._seen):
                     raise ValueError(
                         f"the measurement of step {step} has {counted(len(y), 'number')}; it must have {self._ny}"
                     )
@@ -59,7 +60,7 @@ class Inbox:
 
     @property
     def y(self) -> Array | None:
-        """The measurement of the present step, None while it is missing."""
+        """The measurement of the present step, None while it is missing; empty where the sensor says that it is lost."""
         return self._measurements.get(self._step)
 
     @property
@@ -73,11 +74,10 @@ class Inbox:
         pairs = self._pairs[self._step]
         return next((sender for sender in self._hears[self._modes[self._step]] if sender not in pairs), None)
 
-    @property
-    def heard(self) -> dict[str, Pair]:
-        """The pairs that the present step's mode asks for; complete where nothing is lacking."""
+    def heard(self, *, lost: Container[str] = ()) -> dict[str, Pair]:
+        """The pairs that the present step's mode asks for, without those of `lost`; all must be there."""
         pairs = self._pairs[self._step]
-        return {sender: pairs[sender] for sender in self._hears[self._modes[self._step]]}
+        return {sender: pairs[sender] for sender in self._hears[self._modes[self._step]] if sender not in lost}
 
     def next_step(self) -> None:
         """Forget the present step."""

@@ -88,8 +88,8 @@ def node(peers: Peers, gains: Gains, name: str, steps: int, window: int | None) 
         while (sender := inbox.lacking) is not None:
             inbox.put(sender, Estimate.decode(peers.take(node_who(sender))))
         assert inbox.mode is not None
-        made_by = (inbox.mode, list(inbox.heard))
-        x_hat = step(own, inbox.mode, inbox.heard)
+        made_by = (inbox.mode, list(inbox.heard()))
+        x_hat = step(own, inbox.mode, inbox.heard())
         inbox.next_step()
     return digest.hexdigest()
 

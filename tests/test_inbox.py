@@ -48,7 +48,7 @@ def walked(inbox: Inbox) -> list[list[float]]:
     """x_hat(1), x_hat(2), ... as far as the inbox's messages allow."""
     own, x_hats = GAINS.for_node(NODE), []
     while inbox.y is not None and inbox.mode is not None and inbox.lacking is None:
-        x_hats.append(step(own, inbox.mode, inbox.heard).tolist())
+        x_hats.append(step(own, inbox.mode, inbox.heard()).tolist())
         inbox.next_step()
     return x_hats
 
@@ -106,7 +106,7 @@ def test_what_is_missing_is_named_in_turn() -> None:
         ny = len(GAINS.problem.nodes[GAINS.problem.node_index(sender)].C)
         inbox.put(sender, Estimate(step=0, x_hat=[0.0] * 2, innovation=[0.0] * ny, z_hat=[], mode="", heard=[]))
     assert inbox.lacking is None
-    assert list(inbox.heard) == senders
+    assert list(inbox.heard()) == senders
 
 
 def test_what_belongs_to_a_finished_step_is_dropped() -> None:
@@ -171,5 +171,5 @@ def test_every_node_of_a_run_can_be_walked() -> None:
             inbox.put(*letter)
         for _ in range(STEPS):
             assert inbox.mode is not None
-            assert np.isfinite(step(own, inbox.mode, inbox.heard)).all()
+            assert np.isfinite(step(own, inbox.mode, inbox.heard())).all()
             inbox.next_step()

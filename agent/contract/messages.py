@@ -69,7 +69,7 @@ class PlantState(Message):
 
 
 class Measurement(Message):
-    """y_i(k), eq. (2), (ny_i)."""
+    """y_i(k), eq. (2), (ny_i); empty where nothing arrived at a node that sees its losses."""
 
     y: list[float]
 
@@ -77,6 +77,7 @@ class Measurement(Message):
 class Estimate(Message):
     """What node i sends at step k: x_hat_i(k), and innovation_i(k) = y_i(k) - beta_i C_i x_hat_i(k).
 
+    A node that sees its losses has y_i(k) - C_i x_hat_i(k) for its innovation, and zeros where nothing arrived.
     z_hat_i(k) = M x_hat_i(k). `mode` and `heard` say how x_hat_i(k) was made: the mode of step k - 1 and the
     nodes whose messages of step k - 1 went into it; at step 0, where x_hat is the initial 0, "" and [].
     """

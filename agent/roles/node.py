@@ -12,6 +12,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
 from agent.contract.messages import MODE, Control, Estimate, decode, estimate, measurement
+from agent.contract.schedule import Deliveries
 from agent.filter import innovation, step
 from agent.inbox import Inbox
 from agent.roles.joining import take_part
@@ -20,13 +21,14 @@ from agent.roles.joining import take_part
 def run(bus: Bus, gains: Gains, *, node: str) -> None:
     """Take part as node `node` until the run has ended."""
     problem, own = gains.problem, gains.for_node(node)
-    senders = [problem.node_names[j] for j in problem.ever_heard(problem.node_index(node))]
+    i = problem.node_index(node)
+    senders = {problem.node_names[j]: j for j in problem.ever_heard(i)}
     modes, measurements = bus.channel(MODE), bus.channel(measurement(node))
     estimates = {sender: bus.channel(estimate(sender)) for sender in senders if sender != node}
     bus.advertise([estimate(node)])
 
-    def work(_start: Control) -> None:
-        inbox = Inbox(own)
+    def work(start: Control) -> None:
+        inbox, deliveries = Inbox(own), Deliveries(problem, seed=start.seed)
         x_hat = np.zeros(problem.nx)
         mode, heard = "", list[str]()  # what made x_hat
         for k in count():
@@ -39,10 +41,11 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
                 _put(inbox, modes.next())
             while (sender := inbox.lacking) is not None:
                 _put(inbox, estimates[sender].next())
-            mode, pairs = inbox.mode, inbox.heard
+            phi = deliveries.at(k)[i]
+            mode, pairs = inbox.mode, inbox.heard(lost={sender for sender, j in senders.items() if not phi[j]})
             x_hat, heard = step(own, mode, pairs), list(pairs)
             inbox.next_step()
-            for sender in estimates.keys() - set(heard):  # whom this mode does not hear must not pile up
+            for sender in estimates.keys() - set(heard):  # whose message was not needed must not pile up
                 for sample in estimates[sender].waiting():
                     _put(inbox, sample)
 

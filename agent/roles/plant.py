@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from agent.bus import Bus
+from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, PlantState, decode, measurement
-from agent.contract.problem import Problem
+from agent.contract.problem import Node, Problem
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.roles.joining import take_part
 
@@ -55,9 +56,16 @@ class SimulatedPlant:
             arrived=[int(arrived) for arrived in theta],
         )
         measurements = {
-            node.name: Measurement(step=step, y=(theta_i * (node.C @ x) + node.D @ w).tolist())
+            node.name: Measurement(step=step, y=_measured(node, theta_i, x, w).tolist())
             for node, theta_i in zip(self._problem.nodes, theta, strict=True)
         }
         self._x = plant.A @ x + plant.B @ w
         self._step += 1
         return state, measurements
+
+
+def _measured(node: Node, theta_i: float, x: Array, w: Array) -> Array:
+    """Eq. (2): theta_i C_i x + D_i w, (ny_i,); empty where a node that sees its losses loses this one."""
+    if node.seen and not theta_i:
+        return np.empty(0)
+    return theta_i * (node.C @ x) + node.D @ w

@@ -11,13 +11,23 @@ import numpy as np
 from agent.contract.arrays import Array
 from designer.error_model import realised
 from designer.replay.log import Log
-from designer.replay.proofs import FLOOR, Central, Check, Drawn, Inputs, numbers
+from designer.replay.proofs import FLOOR, Central, Check, Drawn, Flags, Inputs, logged_plant, numbers
+
+
+class Realised(NamedTuple):
+    """Eq. (10) in one step, with the losses and deliveries that there were."""
+
+    A: Array  # (n_eta, n_eta)
+    B: Array  # (n_eta, nw)
+    BB: Array  # (n_eta, n_eta): B B'
+    H: Array  # (n nx, sum ny): by which an input to the innovations acts; without what was not delivered
 
 
 class FreeBlock(NamedTuple):
     """The free run at the steps `first`, `first` + 1, ..."""
 
     first: int
+    x: Array  # (steps, nx): the plant from x(0) = 0
     eta: Array  # (steps, n_eta): eta(k) from eta(0) = 0 by (10)
     reach: Array  # (steps, n_eta): a relative rounding error of t in every step so far moves eta by t reach at most
     path: Array  # (steps,): gamma_path(k), nan where it overflowed
@@ -28,9 +38,10 @@ def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs
     mode = np.where((inputs.mode >= 0) & (inputs.mode < len(log.gains.problem.topologies)), inputs.mode, drawn.mode)
     if log.has_plant:
         theta = np.where(np.isnan(inputs.theta), drawn.theta, inputs.theta)
-        return Inputs(mode, theta, np.where(np.isnan(inputs.w), drawn.w, inputs.w), inputs.u)
-    y = log.innovation + log.x_hat @ central.bar.C_beta.T
-    return inputs._replace(mode=mode, u=np.where(np.isnan(inputs.u), y, inputs.u))
+        return inputs._replace(mode=mode, theta=theta, w=np.where(np.isnan(inputs.w), drawn.w, inputs.w))
+    y = log.innovation + log.x_hat @ central.C_nu.T  # as if it had arrived: then the innovation is the logged one
+    theta = np.where(np.isnan(inputs.theta), 1.0, inputs.theta)
+    return inputs._replace(mode=mode, theta=theta, u=np.where(np.isnan(inputs.u), y, inputs.u))
 
 
 def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Iterator[FreeBlock]:
@@ -43,53 +54,58 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
     sum_j Phi(k, j+1) d_j after k steps. With Y(k+1) = A_k Y(k) A_k' + diag(m_k)^2 the inequality of Cauchy and
     Schwarz bounds entry i of it by t sqrt(k n_eta Y_ii(k)) = t reach_i(k).
     """
-    model, nx, size = central.model, central.problem.nx, central.model.A.shape[1]
+    model, plant, p, size = central.model, central.problem.plant, central.model.plant_states, central.model.size
 
     @lru_cache(maxsize=64)  # small networks have few different ones, large ones no room for many
-    def transition(s: int, theta: bytes) -> Array:
-        return realised(model, s, np.frombuffer(theta))[:, :size]
+    def transition(s: int, theta: bytes, phi: bytes) -> Realised:
+        delivered = central.delivered(np.frombuffer(phi, dtype=bool))
+        AB = realised(model, s, np.frombuffer(theta), delivered)
+        A_k, B_k = AB[:, :size], AB[:, size:]
+        return Realised(A_k, B_k, B_k @ B_k.T, _delivered_gains(central, s, delivered))
 
-    noise = [B_s @ B_s.T for B_s in model.B]
-    eta, covariances, diagonal = np.zeros(size), np.zeros((2, size, size)), np.arange(size)
+    x, eta, covariances, diagonal = np.zeros(len(plant.A)), np.zeros(size), np.zeros((2, size, size)), np.arange(size)
     for first in range(0, log.steps, block):
         steps = range(first, min(first + block, log.steps))
-        s_of, thetas = inputs.mode[first : steps.stop].tolist(), [inputs.theta[k].tobytes() for k in steps]
-        etas, reach = np.empty((len(steps), size)), np.empty((len(steps), size))
+        keys = [(int(inputs.mode[k]), inputs.theta[k].tobytes(), inputs.phi[k].tobytes()) for k in steps]
+        xs, etas, reach = np.empty((len(steps), len(x))), np.empty((len(steps), size)), np.empty((len(steps), size))
         for row, k in enumerate(steps):
-            etas[row] = eta
-            eta = transition(s_of[row], thetas[row]) @ eta + model.B[s_of[row]] @ inputs.w[k]
-            eta[nx:] -= central.H_bar[s_of[row]] @ inputs.u[k]
-        squares = _magnitudes(log, central, inputs, etas, first) ** 2
+            of_step = transition(*keys[row])
+            xs[row], etas[row] = x, eta
+            eta = of_step.A @ eta + of_step.B @ inputs.w[k]
+            eta[p:] -= of_step.H @ inputs.u[k]
+            x = eta[:p] if p else plant.A @ x + plant.B @ inputs.w[k]
+        squares = _magnitudes(log, central, inputs, xs, etas, first) ** 2
         outputs = np.empty((len(steps), len(model.M), len(model.M)))
         for row in range(len(steps)):
-            A_k = transition(s_of[row], thetas[row])
+            A_k, _, BB_k, _ = transition(*keys[row])
             outputs[row] = model.M @ covariances[0] @ model.M.T
             reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
             covariances = A_k @ covariances @ A_k.T
-            covariances[0] += noise[s_of[row]]
+            covariances[0] += BB_k
             covariances[1, diagonal, diagonal] += squares[row]
-        yield FreeBlock(first, etas, np.sqrt(np.maximum(reach, FLOOR**2)), _largest(outputs))
+        yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), _largest(outputs))
 
 
-def free_check(log: Log, central: Central, block: FreeBlock, eta: Array) -> Check:
-    """Proof 3: the free run stays with the log; shown as x_hat(k) = x(k) - e(k). `eta` is the logged one."""
-    nx, steps = central.problem.nx, slice(block.first, block.first + len(block.eta))
-    x = eta[steps, :nx]
-    return numbers(
-        3,
-        "x_hat",
-        block.first,
-        central.owner(nx),
-        log.x_hat[steps],
-        np.tile(x, central.problem.n) - block.eta[:, nx:],
-        block.reach[:, nx:],
-    )
+def _delivered_gains(central: Central, s: int, delivered: Flags | None) -> Array:
+    """H_bar of mode s, its blocks times phi_ij, (n nx, sum ny)."""
+    if delivered is None:
+        return central.H_bar[s]
+    by_row = np.repeat(delivered, central.problem.nx, axis=0)
+    return np.asarray(central.H_bar[s] * by_row[:, central.y_owner])
+
+
+def free_check(log: Log, central: Central, block: FreeBlock) -> Check:
+    """Proof 3: the free run stays with the log; shown as x_hat(k) = x(k) - e(k), with the logged x."""
+    p, steps = central.model.plant_states, slice(block.first, block.first + len(block.eta))
+    expected = np.tile(logged_plant(log)[steps], central.problem.n) - block.eta[:, p:]
+    owner = central.owner(central.problem.nx)
+    return numbers(3, "x_hat", block.first, owner, log.x_hat[steps], expected, block.reach[:, p:])
 
 
 class Path(NamedTuple):
     """Proof 5 over one block: |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2.
 
-    At step 1 it reads |M B w(0)| <= |M B| |w(0)| with the B of the first mode, so it is an equality where w is one
+    At step 1 it reads |M B w(0)| <= |M B| |w(0)| with the B of the first step, so it is an equality where w is one
     number. Later gamma_path(k) |w(0), ..., w(k-1)| is attained by one direction of that vector alone.
     """
 
@@ -106,11 +122,10 @@ def path_block(central: Central, block: FreeBlock, errors: Array, energy_before:
     return Path(block.first, errors[steps], block.path * np.sqrt(energy_before[steps]), rounding)
 
 
-def _magnitudes(log: Log, central: Central, inputs: Inputs, eta: Array, first: int) -> Array:
+def _magnitudes(log: Log, central: Central, inputs: Inputs, x: Array, eta: Array, first: int) -> Array:
     """m_k of `free_run` for one block, from the log, and from the free run where the log has holes."""
-    nx, steps = central.problem.nx, slice(first, first + len(eta))
-    x = eta[:, :nx]
-    x_hat = np.where(np.isnan(log.x_hat[steps]), np.tile(x, central.problem.n) - eta[:, nx:], log.x_hat[steps])
+    p, steps = central.model.plant_states, slice(first, first + len(eta))
+    x_hat = np.where(np.isnan(log.x_hat[steps]), np.tile(x, central.problem.n) - eta[:, p:], log.x_hat[steps])
     magnitude = np.empty_like(eta)
     for s in np.unique(inputs.mode[steps]):
         at = inputs.mode[steps] == s

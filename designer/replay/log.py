@@ -46,7 +46,8 @@ class Log:
     z: Array  # (steps, nz)
     w: Array  # (steps, nw)
     theta: Array  # (steps, n)
-    y: Array  # (steps, sum ny)
+    y: Array  # (steps, sum ny); NaN also where nothing arrived
+    measured: Array  # (steps, n): 1 where y has numbers, 0 where it is empty, NaN where the message is missing
     innovation: Array  # (steps, sum ny)
     x_hat: Array  # (steps, n nx)
     z_hat: Array  # (steps, n nz)
@@ -122,6 +123,7 @@ def _columns(topics: dict[str, Topic], names: tuple[str, ...], steps: int) -> di
         "w": state.column("w", steps),
         "theta": state.column("arrived", steps),
         "y": np.hstack([topics[measurement(name)].column("y", steps) for name in names]),
+        "measured": np.column_stack([topics[measurement(name)].filled("y", steps) for name in names]),
         "innovation": np.hstack([topic.column("innovation", steps) for topic in estimates]),
         "x_hat": np.hstack([topic.column("x_hat", steps) for topic in estimates]),
         "z_hat": np.hstack([topic.column("z_hat", steps) for topic in estimates]),

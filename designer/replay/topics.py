@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Iterable
 
@@ -50,32 +51,41 @@ class Senders:
     """Sets of nodes as numbers; the text of one is its names in file order, "1, 4"."""
 
     def __init__(self, node_names: tuple[str, ...]) -> None:
-        self._words = Words()
+        self.texts: list[str] = []
+        self._node_names = node_names
         self._order = {name: place for place, name in enumerate(node_names)}
-        self._seen: dict[tuple[str, ...], int] = {}
-
-    @property
-    def texts(self) -> list[str]:
-        return self._words.texts
+        self._numbers: dict[tuple[str, ...], int] = {}  # of names in file order
+        self._known: dict[tuple[str, ...], int] = {}  # of names in any order
 
     def number(self, names: Iterable[str]) -> int:
         key = tuple(names)
-        if key not in self._seen:
-            in_order = sorted(key, key=lambda name: (self._order.get(name, len(self._order)), name))
-            self._seen[key] = self._words.number(", ".join(in_order))
-        return self._seen[key]
+        if key not in self._known:
+            in_order = tuple(sorted(key, key=lambda name: (self._order.get(name, len(self._order)), name)))
+            if in_order not in self._numbers:
+                self._numbers[in_order] = len(self.texts)
+                self.texts.append(", ".join(in_order))
+            self._known[key] = self._numbers[in_order]
+        return self._known[key]
+
+    def members(self) -> NDArray[np.bool_]:
+        """(numbers, n): which nodes are in each set."""
+        rows = [[name in names for name in self._node_names] for names in self._numbers]
+        return np.array(rows, dtype=bool).reshape(len(rows), len(self._node_names))
 
 
 class Topic:
     """The messages of one topic in the order of the file.
 
     Where two of them claim the same step the one with the lowest number counts: the order of the file decides
-    nothing. `who` numbers the messages; None for a sensor driver, which need not number them.
+    nothing. `who` numbers the messages; None for a sensor driver, which need not number them. Vectors may be empty
+    where the problem allows it, `may_be_empty`.
     """
 
-    def __init__(self, topic: str, model: type[Message], widths: dict[str, int], *, who: str | None) -> None:
+    def __init__(
+        self, topic: str, model: type[Message], widths: dict[str, int], *, who: str | None, may_be_empty: bool = False
+    ) -> None:
         self.topic, self.who = topic, who
-        self._model, self._widths = model, widths
+        self._model, self._widths, self._may_be_empty = model, widths, may_be_empty
         self._steps, self._numbers = array("q"), array("q")
         self._values = {name: array("d") for name in widths}
         self._words: dict[str, array[int]] = {"mode": array("q"), "heard": array("q")}
@@ -94,7 +104,7 @@ class Topic:
         self._steps.append(message.step)
         self._numbers.append(logged.number)
         for name, values in self._values.items():
-            values.extend(getattr(message, name))
+            values.extend(getattr(message, name) or [math.nan] * self._widths[name])
         if isinstance(message, Mode | Estimate):
             self._words["mode"].append(modes.number(message.mode))
         if isinstance(message, Estimate):
@@ -104,9 +114,9 @@ class Topic:
     def _fault(self, message: Message) -> str:
         for name, width in self._widths.items():
             values = getattr(message, name)
-            if len(values) != width:
+            if len(values) != width and (values or not self._may_be_empty):
                 return f"{name} has {len(values)} numbers where the problem has {width}"
-            if max(map(abs, values)) > CEILING:
+            if values and max(map(abs, values)) > CEILING:
                 return f"{name} holds {max(values, key=abs)}, beyond {CEILING:g}"
         return ""
 
@@ -129,11 +139,18 @@ class Topic:
         return present, order[first]
 
     def column(self, name: str, steps: int) -> Array:
-        """(steps, width), NaN where the message is missing."""
+        """(steps, width), NaN where the message is missing, or the vector is empty."""
         present, rows = self.rows(steps)
         column = np.full((steps, self._widths[name]), np.nan)
         column[present] = np.array(self._values[name]).reshape(-1, self._widths[name])[rows]
         return column
+
+    def filled(self, name: str, steps: int) -> Array:
+        """(steps,): 1 where the vector has numbers, 0 where it is empty, NaN where the message is missing."""
+        filled = np.full(steps, np.nan)
+        present, _ = self.rows(steps)
+        filled[present] = np.isfinite(self.column(name, steps)[present, 0])
+        return filled
 
     def words(self, name: str, steps: int) -> Numbers:
         """(steps,), -1 where the message is missing."""
@@ -151,5 +168,6 @@ def topics_of(problem: Problem, external: tuple[bool, ...]) -> dict[str, Topic]:
         ny = node.C.shape[0]
         widths = {"x_hat": problem.nx, "innovation": ny, "z_hat": problem.nz}
         topics.append(Topic(estimate(node.name), Estimate, widths, who=node_who(node.name)))
-        topics.append(Topic(measurement(node.name), Measurement, {"y": ny}, who=None if is_real else PLANT))
+        who = None if is_real else PLANT
+        topics.append(Topic(measurement(node.name), Measurement, {"y": ny}, who=who, may_be_empty=node.seen))
     return {topic.topic: topic for topic in topics}
