@@ -60,7 +60,7 @@ class Inbox:
 
     @property
     def y(self) -> Array | None:
-        """The measurement of the present step, None while it is missing; empty where the sensor says that it is lost."""
+        """The measurement of the present step, None while it is missing; empty where nothing arrived."""
         return self._measurements.get(self._step)
 
     @property

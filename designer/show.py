@@ -72,6 +72,9 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "outputs": problem.nz,
         "measurements": sum(len(node.C) for node in problem.nodes),
         "arrival_probability": problem.beta.tolist(),
+        "sees_its_losses": [node.name for node in problem.nodes if node.seen],
+        "lossy_links": {f"{link.sender} to {link.receiver}": link.delivery_probability for link in problem.links or ()},
+        "unbiased": bool(problem.unbiased),
         "disturbance": problem.disturbance.kind,
         "digest": problem.digest(),
     }

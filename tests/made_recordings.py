@@ -1,9 +1,12 @@
-"""Recordings for tests: networks, gains and runs made here, node by node and link by link from eqs. (1)-(5)."""
+"""Recordings for tests: networks, gains and runs made here, node by node and link by link from eqs. (1)-(5).
+
+Seen losses, lossy links and unbiased gains too. A run may hold misdeeds, for replay to find.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,6 +65,56 @@ def random_problem(
     )
 
 
+def real_problem(
+    seed: int, *, radius: float = 0.85, seen: bool = True, links: bool = True, unbiased: bool = True, **sizes: Any
+) -> Problem:
+    """`random_problem` with a plant of this spectral radius, and what real networks have beside it.
+
+    Where losses are `seen`, all that lose measurements see it, and so does the last node, which may lose none. Where
+    `links` lose messages, every second one does.
+    """
+    problem = random_problem(seed, **sizes)
+    document = problem.document()
+    document["plant"]["A"] = (problem.plant.A * (radius / 0.85)).tolist()
+    names = problem.node_names
+    heard = [(i, j) for i in range(problem.n) for j in problem.ever_heard(i) if i != j]
+    if seen:
+        for i, node in enumerate(document["node"]):
+            node["loss"] = "seen" if i % 2 or i == problem.n - 1 else "hidden"
+    if links:
+        document["link"] = [
+            {"receiver": names[i], "sender": names[j], "delivery_probability": 0.6 + 0.1 * (number % 4)}
+            for number, (i, j) in enumerate(heard[::2])
+        ]
+    document["unbiased"] = unbiased
+    return Problem.from_document(document)
+
+
+def observer_gains(problem: Problem) -> Gains:
+    """Unbiased gains: each node is a Kalman predictor of what it hears, drawn towards the estimates of the others."""
+    A, identity = problem.plant.A, np.eye(problem.nx)
+    K: LinkMatrices = {}
+    H: LinkMatrices = {}
+    for s, topology in enumerate(problem.topologies):
+        K[topology.name], H[topology.name] = {}, {}
+        for i, receiver in enumerate(problem.node_names):
+            heard, a = problem.neighbours(s, i), topology.adjacency[i]
+            C = np.vstack([problem.nodes[j].C for j in heard])
+            P = identity
+            for _ in range(100):
+                L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.eye(len(C)))
+                P = A @ P @ A.T + identity - L @ C @ P @ A.T
+            others = {problem.node_names[j]: 0.3 * A / (len(heard) - 1) / a[j] for j in heard if j != i}
+            weighted = [a[problem.node_index(name)] * block for name, block in others.items()]
+            K[topology.name][receiver] = others | {receiver: (A - sum(weighted, start=0.0 * A)) / a[i]}
+            columns = np.cumsum([0] + [len(problem.nodes[j].C) for j in heard])
+            H[topology.name][receiver] = {
+                problem.node_names[j]: L[:, first:end] / a[j]
+                for j, first, end in zip(heard, columns[:-1], columns[1:], strict=True)
+            }
+    return uncertified(problem, K, H, method="observers")
+
+
 def random_gains(problem: Problem, seed: int = 0) -> Gains:
     """Small gains, so that the errors stay bounded; they are good for nothing else."""
     rng = np.random.default_rng(seed)
@@ -78,10 +131,15 @@ def random_gains(problem: Problem, seed: int = 0) -> Gains:
                 name: rng.uniform(-size, size, (problem.nx, len(problem.nodes[j].C)))
                 for name, j in zip(names, heard, strict=True)
             }
+    return uncertified(problem, K, H, method="random")
+
+
+def uncertified(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, method: str) -> Gains:
+    """Gains of which nothing is proved."""
     return Gains(
         problem=problem,
         problem_digest=problem.digest(),
-        method="random",
+        method=method,
         K=K,
         H=H,
         certificate=Certificate(gamma=1.0, kind="lyapunov", form="full", holds=False, verified="nothing", margins={}),
@@ -97,15 +155,24 @@ def simulate(
     seed: int = 1,
     real_y: dict[str, Any] | None = None,
     nudge: tuple[int, str, float] | None = None,
+    uses: Mapping[tuple[int, str, str], bool] | None = None,
+    says: Mapping[tuple[int, str, str], bool] | None = None,
+    peeks: Container[tuple[int, str]] = (),
+    forgets_itself: bool = False,
 ) -> list[Sent]:
     """Every message of a lock-step run.
 
-    `real_y` maps a node to (steps, ny) numbers from a real sensor; `nudge` moves one node's estimate at one step,
-    and the run goes on from there.
+    `real_y` maps a node to (steps, ny) numbers from a real sensor, [] where it has none; `nudge` moves one node's
+    estimate at one step, and the run goes on from there.
+
+    Misdeeds: `uses` (step, receiver, sender) decides over a message in place of the seed, `says` what the receiver
+    tells of it. At (step, node) of `peeks` a node uses the measurement that it lost. Where the gains are unbiased,
+    a node that `forgets_itself` draws nothing from x_hat_j - x_hat_i, but takes x_hat_j.
     """
     problem, real = gains.problem, real_y or {}
     A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
     chain, losses = schedule.modes(problem, seed=seed), schedule.Losses(problem, seed=seed)
+    deliveries = schedule.Deliveries(problem, seed=seed)
     source, sent = schedule.DisturbanceSource(problem, seed=seed), _Numbered()
     x, mode = np.zeros(problem.nx), ""
     x_hat = {name: np.zeros(problem.nx) for name in problem.node_names}
@@ -121,11 +188,19 @@ def simulate(
         for node, theta_i in zip(problem.nodes, theta, strict=True):
             y = theta_i * (node.C @ x) + node.D @ w
             who = messages.PLANT
+            if node.seen and not theta_i:
+                y = np.empty(0)
             if node.name in real:
-                y, who = real[node.name][k], messages.sensor_who(node.name)
+                y, who = np.asarray(real[node.name][k]), messages.sensor_who(node.name)
             sent.add(messages.measurement(node.name), who, step=k, y=y)
             x_hat_i = x_hat[node.name]
-            innovation[node.name] = y - node.arrival_probability * node.C @ x_hat_i
+            if (k, node.name) in peeks:
+                assert not len(y), "nothing was lost"
+                y = node.C @ x + node.D @ w
+            if not node.seen:
+                innovation[node.name] = y - node.arrival_probability * node.C @ x_hat_i
+            else:
+                innovation[node.name] = y - node.C @ x_hat_i if len(y) else np.zeros(len(node.C))
             sent.add(
                 messages.estimate(node.name),
                 messages.node_who(node.name),
@@ -140,14 +215,22 @@ def simulate(
         mode = problem.mode_names[s]
         sent.add("mode", messages.COORDINATOR, step=k, mode=mode)
         before, x = x_hat, A @ x + B @ w
-        x_hat = {}
+        phi, x_hat = deliveries.at(k), {}
         for i, name in enumerate(problem.node_names):
-            heard[name] = [problem.node_names[j] for j in problem.neighbours(s, i)]
-            a, K, H = problem.topologies[s].adjacency[i], gains.K[mode][name], gains.H[mode][name]
-            x_hat[name] = sum(
-                (a[problem.node_index(j)] * (K[j] @ before[j] + H[j] @ innovation[j]) for j in heard[name]),
-                start=np.zeros(problem.nx),
-            )
+            neighbours = {problem.node_names[j]: bool(phi[i, j]) for j in problem.neighbours(s, i)}
+            used = {j: (uses or {}).get((k, name, j), delivered) for j, delivered in neighbours.items()}
+            heard[name] = [j for j, is_used in used.items() if (says or {}).get((k, name, j), is_used)]
+            x_hat[name] = np.zeros(problem.nx)
+            for j, is_used in used.items():
+                a_ij = problem.topologies[s].adjacency[i, problem.node_index(j)]
+                K_ij, H_ij, own = gains.K[mode][name][j], gains.H[mode][name][j], before[name]
+                x_hat_j, nu_j = (before[j], innovation[j]) if is_used else (own, 0.0 * innovation[j])
+                if not problem.unbiased:
+                    x_hat[name] += a_ij * (K_ij @ x_hat_j + H_ij @ nu_j)
+                elif j == name:
+                    x_hat[name] += A @ own + a_ij * H_ij @ nu_j
+                else:
+                    x_hat[name] += a_ij * (K_ij @ (x_hat_j if forgets_itself else x_hat_j - own) + H_ij @ nu_j)
     sent.add("event", messages.COORDINATOR, step=max(steps - 1, 0), kind="end", who="coordinator", detail="")
     return sent.messages
 

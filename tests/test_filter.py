@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_recordings import random_gains, random_problem
+from made_recordings import observer_gains, random_gains, random_problem, real_problem
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
@@ -67,10 +67,55 @@ def test_who_is_not_heard_does_not_matter(gains: Gains) -> None:
             assert step(own, mode, heard).tobytes() == step(own, mode, pairs).tobytes()
 
 
-def test_who_is_heard_must_be_there(gains: Gains) -> None:
+def test_a_node_must_be_among_those_it_heard(gains: Gains) -> None:
     own = gains.for_node("n0")
     with pytest.raises(KeyError, match="n0"):
         step(own, "mode-0", {})
+
+
+# messages that do not arrive
+@given(st.integers(0, 50))
+def test_a_node_stands_in_for_whom_it_did_not_hear(seed: int) -> None:
+    """Its own estimate, and no innovation: eqs. (4)(5) of a network in which the sender had said just that."""
+    gains = random_gains(random_problem(seed, ny=(1, 3, 2), modes=2), seed)
+    pairs = random_pairs(gains, seed)
+    for mode in gains.problem.mode_names:
+        for name in gains.problem.node_names:
+            own = gains.for_node(name)
+            for silent in {link.sender for link in own.links[mode]} - {name}:
+                heard = {sender: pair for sender, pair in pairs.items() if sender != silent}
+                pretended = pairs | {silent: Pair(pairs[name].x_hat, 0.0 * pairs[silent].innovation)}
+                expected = written_out(gains, mode, name, pretended)
+                np.testing.assert_allclose(step(own, mode, heard), expected, rtol=1e-12, atol=1e-14)
+
+
+# unbiased gains
+@given(st.integers(0, 50), st.booleans())
+def test_an_unbiased_step_is_equations_4_and_5_written_out(seed: int, all_arrive: bool) -> None:
+    """With K_ii as the file has it: the two differ by its rounding alone. Lost messages are stood in for."""
+    gains = observer_gains(real_problem(seed, radius=1.02, ny=(1, 3, 2), nx=3))
+    pairs = random_pairs(gains, seed)
+    for mode in gains.problem.mode_names:
+        for name in gains.problem.node_names:
+            own = gains.for_node(name)
+            lost = set() if all_arrive else set(gains.problem.node_names[:2]) - {name}
+            heard = {sender: pair for sender, pair in pairs.items() if sender not in lost}
+            stood_in = {sender: Pair(pairs[name].x_hat, 0.0 * pairs[sender].innovation) for sender in lost}
+            expected = written_out(gains, mode, name, pairs | stood_in)
+            np.testing.assert_allclose(step(own, mode, heard), expected, rtol=1e-11, atol=1e-12)
+
+
+def test_nodes_that_agree_follow_the_plant_bit_for_bit() -> None:
+    """x_hat_j = x for all and no innovation gives A x exactly, however large x: K_ii is not the rounded one."""
+    gains = observer_gains(real_problem(2, radius=1.02))
+    x = np.array([1e12 / 3.0, -1e12 / 7.0])
+    agreed = {node.name: Pair(x, np.zeros(len(node.C))) for node in gains.problem.nodes}
+    rounded = 0
+    for mode in gains.problem.mode_names:
+        for name in gains.problem.node_names:
+            assert step(gains.for_node(name), mode, agreed).tolist() == (gains.problem.plant.A @ x).tolist()
+            rounded += written_out(gains, mode, name, agreed) != (gains.problem.plant.A @ x).tolist()
+    assert rounded > 0  # by the gains of the file it would not have been exact
 
 
 @given(st.integers(0, 50), st.randoms(use_true_random=False))
@@ -148,3 +193,16 @@ def test_a_perfect_estimate_without_loss_leaves_the_noise() -> None:
     assert node.arrival_probability == 1.0
     left = innovation(gains.for_node("n0"), node.C @ x + node.D @ w, x)
     np.testing.assert_allclose(left, node.D @ w, rtol=1e-12, atol=1e-14)
+
+
+# a node that sees its losses
+def test_a_node_that_sees_its_losses_takes_the_whole_of_what_arrives() -> None:
+    """y - C x_hat whatever beta is, and 0 where nothing arrived."""
+    problem = real_problem(2, ny=(1, 3), modes=1)
+    node, own = problem.nodes[1], observer_gains(problem).for_node("n1")
+    assert (node.seen, node.arrival_probability) == (True, 0.8)
+    rng = np.random.default_rng(0)
+    x, w, x_hat = rng.normal(size=2), rng.normal(size=2), rng.normal(size=2)
+    arrived = innovation(own, node.C @ x + node.D @ w, x_hat)
+    np.testing.assert_allclose(arrived, node.C @ (x - x_hat) + node.D @ w, rtol=1e-12, atol=1e-14)
+    assert innovation(own, np.empty(0), x_hat).tolist() == [0.0, 0.0, 0.0]

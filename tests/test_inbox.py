@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_recordings import random_gains, random_problem, simulate
+from made_recordings import observer_gains, random_gains, random_problem, real_problem, simulate
 
 from agent.contract.gains import Gains
 from agent.contract.messages import Estimate, Measurement, Message, Mode, model_of
@@ -173,3 +173,40 @@ def test_every_node_of_a_run_can_be_walked() -> None:
             assert inbox.mode is not None
             assert np.isfinite(step(own, inbox.mode, inbox.heard())).all()
             inbox.next_step()
+
+
+# a node that sees its losses, and messages that are lost
+def test_an_empty_measurement_is_legal_where_losses_are_seen() -> None:
+    """And is not taken for one that is missing. Any other number of numbers is refused as ever."""
+    gains = observer_gains(real_problem(5, ny=(1, 2, 1)))
+    inbox = Inbox(gains.for_node("n1"))
+    assert inbox.y is None
+    inbox.put("", Measurement(step=0, y=[]))
+    assert inbox.y is not None
+    assert inbox.y.tolist() == []
+    for y in ([1.0], [1.0, 2.0, 3.0]):
+        with pytest.raises(ValueError, match=rf"the measurement of step 1 has {len(y)} numbers?; it must have 2"):
+            inbox.put("", Measurement(step=1, y=y))
+    blind = Inbox(gains.for_node("n0"))
+    with pytest.raises(ValueError, match="the measurement of step 0 has 0 numbers; it must have 1"):
+        blind.put("", Measurement(step=0, y=[]))
+
+
+def test_a_lost_message_must_have_come_but_is_not_heard() -> None:
+    """A modelled loss is data: the step waits for the message all the same, and then does as if it had not come."""
+    inbox = filled([letter for letter in LETTERS if letter.sender != "n1"])
+    k = next(k for k in range(STEPS) if "n1" in {link.sender for link in GAINS.for_node(NODE).links[modes_of_run()[k]]})
+    for _ in range(k):
+        inbox.next_step()
+    assert inbox.mode is not None
+    assert inbox.lacking == "n1"
+    for letter in LETTERS:
+        if letter.sender == "n1":
+            inbox.put(*letter)
+    assert inbox.lacking is None
+    assert "n1" in inbox.heard()
+    assert list(inbox.heard(lost={"n1"})) == [sender for sender in inbox.heard() if sender != "n1"]
+
+
+def modes_of_run() -> list[str]:
+    return [letter.message.mode for letter in LETTERS if isinstance(letter.message, Mode)]

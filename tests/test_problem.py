@@ -49,6 +49,13 @@ SINE = 'kind = "damped-sine"\ndecay = 0.2'
 CSV = 'kind = "csv"\nfile = "w.csv"'
 JOINED = "adjacency = [[1, 1], [1, 1]]"
 HUGE = "1" + "0" * 400
+LINK = """[[link]]
+receiver = "left"
+sender = "right"
+delivery_probability = 0.9
+"""
+LINKED = TEXT.replace("[markov]", LINK + "[markov]")
+UNSTABLE = TEXT.replace("A = [[0.5", "A = [[-1.02")
 
 
 def load(folder: Path, text: str | bytes) -> Problem:
@@ -60,6 +67,18 @@ def load(folder: Path, text: str | bytes) -> Problem:
 def edited(old: str, new: str) -> str:
     assert TEXT.count(old) == 1, old
     return TEXT.replace(old, new)
+
+
+def linked(old: str, new: str) -> str:
+    """LINKED with the one link edited."""
+    assert LINK.count(old) == 1, old
+    return LINKED.replace(LINK, LINK.replace(old, new))
+
+
+def unstable(*, left: str = "", unbiased: str = "") -> str:
+    """UNSTABLE, with a word on the losses of the left node, and one on the gains."""
+    text = UNSTABLE.replace('name = "left"\n', f'name = "left"\n{left}\n')
+    return text.replace('name = "pair"\n', f'name = "pair"\n{unbiased}\n')
 
 
 def refusal(folder: Path, text: str | bytes) -> str:
@@ -129,6 +148,31 @@ def test_long_lists_of_names_are_cut(count: int, text: str) -> None:
     assert said == text if count < 9 else said == text + '... 1 more ... and "8"'
 
 
+# what real networks have
+def test_seen_losses_links_and_unbiased_gains_are_read(tmp_path: Path) -> None:
+    text = LINKED.replace('name = "left"\n', 'name = "left"\nloss = "seen"\n')
+    problem = load(tmp_path, text.replace("[plant]", "unbiased = true\n[plant]"))
+    assert [node.seen for node in problem.nodes] == [True, False]
+    assert problem.delivery.tolist() == [[1.0, 0.9], [1.0, 1.0]]  # row i for what node i gets
+    assert problem.unbiased is True
+    assert not problem.carries_plant  # the other node loses nothing
+    assert Problem.from_document(problem.document()) == problem
+    assert load(tmp_path, text).carries_plant
+    assert load(tmp_path, edited('name = "pair"', 'name = "pair"\nunbiased = true')).carries_plant
+
+
+def test_a_delivery_probability_of_1_loses_nothing(tmp_path: Path) -> None:
+    problem = load(tmp_path, linked("0.9", "1"))
+    assert problem.delivery.tolist() == [[1.0, 1.0], [1.0, 1.0]]
+
+
+def test_an_unstable_plant_is_admissible_where_the_errors_do_not_contain_the_state(tmp_path: Path) -> None:
+    problem = load(tmp_path, unstable(left='loss = "seen"', unbiased="unbiased = true"))
+    assert abs(np.linalg.eigvals(problem.plant.A)).max() == pytest.approx(1.02)
+    nothing_lost = unstable(unbiased="unbiased = true").replace("arrival_probability = 0.75", "arrival_probability = 1")
+    assert not load(tmp_path, nothing_lost).carries_plant
+
+
 # what is refused
 REFUSED = [
     # missing, unknown and misspelt fields
@@ -188,6 +232,41 @@ REFUSED = [
      "plant: A is unstable: its spectral radius is 1 and must be below 1, "
      "because the errors contain the state; an unstable plant needs unbiased = true, "
      'and loss = "seen" at every node that loses measurements'),
+    # an unstable plant where the errors contain the state
+    (unstable(left='loss = "seen"'),
+     "plant: A is unstable: its spectral radius is 1.02 and must be below 1, "
+     "because the errors contain the state; an unstable plant needs unbiased = true, "
+     'and loss = "seen" at every node that loses measurements'),
+    (unstable(unbiased="unbiased = true"),
+     'plant: A is unstable, its spectral radius is 1.02, and node "left" does not know which of its measurements are '
+     'lost: its errors then contain the state; give it loss = "seen"'),
+    # losses that are seen, links that lose messages, unbiased gains
+    (edited('name = "left"', 'name = "left"\nloss = "sometimes"'),
+     "node \"left\": loss: must be 'hidden' or 'seen', got 'sometimes'"),
+    (edited('name = "left"', 'name = "left"\nloss = true'),
+     "node \"left\": loss: must be 'hidden' or 'seen', got True"),
+    (edited('name = "pair"', 'name = "pair"\nunbiased = "yes"'), "unbiased: must be true or false, got 'yes'"),
+    (edited('name = "pair"', 'name = "pair"\nunbiased = 1'), "unbiased: must be true or false, got 1"),
+    (linked('receiver = "left"', 'receiver = "top"'),
+     'link from "right" to "top": node "top" does not exist; the problem has nodes "left" and "right"'),
+    (linked('sender = "right"', 'sender = "top"'),
+     'link from "top" to "left": node "top" does not exist; the problem has nodes "left" and "right"'),
+    (linked('sender = "right"', 'sender = "left"'),
+     'link from "left" to "left": a node has its own numbers always; name two nodes'),
+    (LINKED.replace(JOINED, "adjacency = [[1, 0], [1, 1]]"),
+     'link from "right" to "left": "left" hears "right" in no topology'),
+    (LINKED.replace(LINK, LINK + LINK), 'link from "right" to "left" is there twice; give it one delivery_probability'),
+    (linked("0.9", "0.0"), "link number 1: delivery_probability: 0.0 is not in (0, 1]; "
+     "1 means that every message arrives"),
+    (linked("0.9", "1.1"), "link number 1: delivery_probability: 1.1 is not in (0, 1]; "
+     "1 means that every message arrives"),
+    (linked("0.9", "nan"), "link number 1: delivery_probability: must be finite, got nan"),
+    (linked("0.9", '"0.9"'), "link number 1: delivery_probability: must be a number, got '0.9'"),
+    (linked('receiver = "left"\n', ""), 'link number 1: "receiver" is missing'),
+    (linked('receiver = "left"', "receiver = 1"), "link number 1: receiver: must be a string, got 1"),
+    (linked("delivery_probability", "delivery"),
+     'link number 1: delivery: this key is not known here; "delivery_probability" is missing'),
+    ("link = []\n" + TEXT, "link: must have at least 1, got []"),
     # probabilities
     (edited("0.75\n", "0.0\n"),
      'node "left": arrival_probability: 0.0 is not in (0, 1]; 1 means that no measurement is ever lost'),
@@ -333,6 +412,20 @@ def test_the_digest_does_not_depend_on_the_order_in_the_file(tmp_path: Path) -> 
 
 def test_the_digest_does_not_depend_on_how_a_number_is_written(tmp_path: Path) -> None:
     assert load(tmp_path, edited("0.75\n", "7.5e-1\n")).digest() == load(tmp_path, TEXT).digest()
+
+
+def test_the_digest_does_not_depend_on_saying_what_goes_without_saying(tmp_path: Path) -> None:
+    """Losses are hidden and gains not imposed to be unbiased unless a file says otherwise."""
+    said = edited('name = "left"', 'name = "left"\nloss = "hidden"').replace("[plant]", "unbiased = false\n[plant]")
+    assert load(tmp_path, said).digest() == load(tmp_path, TEXT).digest()
+    others = {load(tmp_path, text).digest() for text in (
+        TEXT,
+        edited('name = "left"', 'name = "left"\nloss = "seen"'),
+        edited('name = "pair"', 'name = "pair"\nunbiased = true'),
+        LINKED,
+        linked("0.9", "0.8"),
+    )}  # fmt: skip
+    assert len(others) == 5
 
 
 def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:

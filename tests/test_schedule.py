@@ -14,13 +14,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_recordings import random_problem
+from made_recordings import random_problem, real_problem
 
 from agent.contract.problem import Problem
 from agent.contract.schedule import (
+    DELIVERIES,
     DISTURBANCE,
     LOSSES,
     MODES,
+    Deliveries,
     DisturbanceSource,
     Losses,
     Stream,
@@ -96,7 +98,7 @@ def test_many_steps_at_once_are_the_same_draws(seed: int, first: int, steps: int
 def test_no_two_seeds_streams_or_steps_share_a_draw() -> None:
     draws = [
         value
-        for seed, stream in itertools.product((0, 1, 2, 2**63 - 1), (MODES, LOSSES, DISTURBANCE))
+        for seed, stream in itertools.product((0, 1, 2, 2**63 - 1), (MODES, LOSSES, DISTURBANCE, DELIVERIES))
         for value in Stream(seed=seed, stream=stream, width=3).uniform(0, 300).ravel()
     ]
     assert len(set(draws)) == len(draws)
@@ -177,6 +179,41 @@ def test_where_beta_is_1_nothing_is_lost() -> None:
     assert all(source.at(step)[0] == 1.0 for step in range(2000))
 
 
+# deliveries
+def test_messages_arrive_with_the_probability_of_their_link_independently() -> None:
+    """Frequencies of every link and of every pair of links, within 6 standard deviations; other messages always."""
+    problem, steps = real_problem(6, ny=(1, 1, 1, 1), modes=3), 20_000
+    links = problem.links or ()
+    assert len({link.delivery_probability for link in links}) > 1
+    source, rho = Deliveries(problem, seed=3), problem.delivery
+    delivered = np.array([source.at(step) for step in range(steps)])
+    assert delivered[:, rho == 1.0].all()
+    assert (rho < 1.0).sum() == len(links)
+    arrived, rho = delivered[:, rho < 1.0].astype(float), rho[rho < 1.0]
+    pairs = np.outer(rho, rho)
+    np.fill_diagonal(pairs, rho)
+    deviation = np.sqrt(pairs * (1.0 - pairs) / steps)
+    assert (np.abs(arrived.T @ arrived / steps - pairs) <= 6.0 * deviation).all()
+
+
+@given(SEEDS, st.lists(st.integers(0, 2000), min_size=1, max_size=12))
+def test_deliveries_are_addressed_by_their_step(seed: int, steps: list[int]) -> None:
+    """A node that has followed the run and a replay that begins anywhere see the same; each link has its own draw."""
+    problem = real_problem(6)
+    names, followed = problem.node_names, Deliveries(problem, seed=seed)
+    draws = Stream(seed=seed, stream=DELIVERIES, width=len(problem.links or ()))
+    for step in steps:
+        delivered = followed.at(step)
+        assert delivered.tolist() == Deliveries(problem, seed=seed).at(step).tolist()
+        for draw, link in zip(draws.at(step), problem.links or (), strict=True):
+            arrives = delivered[names.index(link.receiver), names.index(link.sender)]
+            assert arrives == (draw < link.delivery_probability)
+
+
+def test_without_links_every_message_arrives() -> None:
+    assert all(Deliveries(random_problem(6), seed=0).at(step).all() for step in range(300))
+
+
 # disturbance
 def test_without_disturbance_w_is_0() -> None:
     assert DisturbanceSource(disturbed(kind="none"), seed=1).at(7).tolist() == [0.0, 0.0, 0.0]
@@ -246,6 +283,11 @@ def test_modes_losses_and_noise_are_those_of_every_version() -> None:
     losses = Losses(random_problem(6, ny=(1, 1, 1, 1), modes=1), seed=1)
     lost = [step for step in range(40) if losses.at(step)[1] == 0.0]
     assert lost == [11, 15, 20, 21, 22, 27, 28, 35]
+    problem = real_problem(6, ny=(1, 1, 1, 1), modes=1)
+    link = (problem.links or ())[0]
+    deliveries, i, j = Deliveries(problem, seed=1), problem.node_index(link.receiver), problem.node_index(link.sender)
+    assert link.delivery_probability == 0.6
+    assert [step for step in range(20) if not deliveries.at(step)[i, j]] == [0, 3, 5, 7, 9, 10, 17]
     noise = DisturbanceSource(disturbed(kind="white", deviation=1.0), seed=1)
     # the last bits of log and cos are the mathematics library's
     np.testing.assert_allclose(noise.at(0), [1.4175525599465526, -0.6315636844319794, 0.20813939571956022], rtol=1e-14)

@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from made_recordings import random_gains, random_problem, record, simulate
+from made_recordings import random_gains, random_problem, real_problem, record, simulate
 
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
@@ -28,6 +28,21 @@ def test_a_built_in_problem_is_described_by_name_and_by_path() -> None:
     by_path = show.describe(show.PROBLEMS / "zhu2020-lossy.toml")
     assert by_path.pop("file").endswith("zhu2020-lossy.toml")
     assert by_path == facts
+
+
+def test_what_real_networks_have_is_described(tmp_path: Path) -> None:
+    problem = real_problem(1, ny=(1, 1, 1), modes=1)
+    assert [(link.receiver, link.sender) for link in problem.links or ()] == [("n1", "n2")]
+    facts = show._problem(problem)
+    assert facts["sees_its_losses"] == ["n1", "n2"]
+    assert facts["lossy_links"] == {"n2 to n1": 0.6}
+    assert facts["unbiased"] is True
+    text = show.text(facts)
+    assert re.search("sees its losses +n1, n2\n", text)
+    assert re.search("lossy links +n2 to n1: 0.6\n", text)
+    assert re.search("unbiased +yes\n", text)
+    plain = show.text(show.describe("zhu2020-lossy"))
+    assert re.search("sees its losses +-\nlossy links +-\nunbiased +no\n", plain)
 
 
 def test_without_a_file_the_built_in_problems_are_listed() -> None:

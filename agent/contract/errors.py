@@ -94,6 +94,8 @@ _WANTED = {  # what pydantic asks for, as a person says it who writes TOML
     "string_type": "must be a string",
     "float_type": "must be a number",
     "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "literal_error": "must be {expected}",
     "finite_number": "must be finite",
     "greater_than": "must be greater than {gt:g}",
     "greater_than_equal": "must be at least {ge:g}",

@@ -35,7 +35,7 @@ _NUMBERS_AT_ONCE = 2_000_000  # of output covariances held at once, 16 MB
 
 
 def tolerance(problem: Problem) -> float:
-    """The one tolerance: 5 (n_eta + sum ny + nw + n + 4) u, relative, with u = 2^-53; more with links or unbiased gains.
+    """The one tolerance: 5 (n_eta + sum ny + nw + n + 4) u, relative, with u = 2^-53; links and bias below.
 
     Every sum in float64 is the exact sum of terms that are each off by a factor (1 + d)^m, |d| <= u, where m
     counts the operations that a term goes through; to first order its error is at most m u times the sum of the
@@ -56,8 +56,9 @@ def tolerance(problem: Problem) -> float:
     most, the rounding of that sum with it. That number is added. The node's own sums have one term and one difference
     more, for which the bound above has room.
 
-    No gain enters: what large gains amplify is in the magnitude, and so is a state that grows. One unit in the last place of an estimate is a
-    gap of at most 2 u and lies within; a change of 1e-6 of it lies eight orders of magnitude above u.
+    No gain enters: what large gains amplify is in the magnitude, and so is a state that grows. One unit in the last
+    place of an estimate is a gap of at most 2 u and lies within; a change of 1e-6 of it lies eight orders of magnitude
+    above u.
     """
     ny = sum(node.C.shape[0] for node in problem.nodes)
     n_eta = problem.nx * (problem.n + 1)

@@ -89,7 +89,7 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
 def _delivered_gains(central: Central, s: int, delivered: Flags | None) -> Array:
     """H_bar of mode s, its blocks times phi_ij, (n nx, sum ny)."""
     if delivered is None:
-        return central.H_bar[s]
+        return np.asarray(central.H_bar[s])
     by_row = np.repeat(delivered, central.problem.nx, axis=0)
     return np.asarray(central.H_bar[s] * by_row[:, central.y_owner])
 

@@ -122,7 +122,7 @@ class Central:
             for s, i, columns, V_l in zip(links.mode, links.receiver, links.columns, links.V, strict=True):
                 here = columns < model.size
                 touches[s, p + i * nx : p + (i + 1) * nx, columns[here]] |= (V_l[:, here] != 0.0).T
-        return touches.astype(float)
+        return np.asarray(touches, dtype=np.float64)
 
     def owner(self, width: int) -> Numbers:
         """The node of each column of a stacked vector with `width` numbers for each node."""
