@@ -186,7 +186,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
 
 def certified(problem: Problem, given: GivenGains) -> Gains:
     """A gains file of the given gains, with a certificate of their exact gain; or Unattainable."""
-    certificate = certify(problem, *stacked_links(problem, given.K, given.H))
+    certificate = certify(problem, given.K, given.H)
     return Gains(
         problem=problem,
         problem_digest=problem.digest(),

@@ -1,24 +1,31 @@
-"""From a solver's answer, which lies on the boundary of (17), to a P and a gamma that the check confirms.
+"""From a solver's answer, which lies on the boundary of (17), to a P and a gamma that can be proved.
 
 A solver's P satisfies (17) with nothing to spare, or misses it by its tolerance. Take any P0 with
 P0 - L(P0) >= W/2 > 0, where L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i is the left upper corner of (17). Then
 (1 - t)(P + tau P0) has, on the diagonal of (17), t I more in w and tau W/2 more in eta; the cross terms that
 P0 brings are outweighed if tau <= t / (2 lambda_max(B'P0_bar B + 2 C'W^-1 C)), C = A'P0_bar B. So (17) becomes
-strict, and gamma grows by about t/2 of itself.
+strict, and gamma grows by about t/2 of itself. Where noise acts on w, as seen losses do, B'P0_bar B and A'P0_bar B
+stand for the corners of the whole quadratic form, noise within.
+
+Candidates are screened by Cholesky in floats; the first that passes is proved in ball arithmetic, or the next is tried.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.certificate import Verdict, check, least_gamma
-from designer.error_model import ErrorModel, error_model
+from designer.certificate import Verdict, check
+from designer.error_model import ErrorModel, error_model, stacked_links
 from designer.gain import Operator
+
+Form = Literal["structured", "full"]
 
 _ABOVE = 1.0 + 1e-9  # gamma stands this factor above the infimum of (18), so that (18) is strict
 _MOST_STEPS = 5000
@@ -29,26 +36,33 @@ class Confirmed(NamedTuple):
     """The P that was tried last, in which form it is, how far it was backed off, and what the check says of it."""
 
     P: Array  # (modes, n_eta, n_eta)
-    form: Literal["structured", "full"]
+    form: Form
     t: float
     verdict: Verdict
 
 
-def back_off(problem: Problem, K_bar: Array, H_bar: Array, P: Array) -> Confirmed:
-    """The first P(t), from t = 0 upwards, whose gamma the check confirms; if none is, the one tried last.
+def back_off(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array) -> Confirmed:
+    """The first P(t), from t = 0 upwards, whose gamma is proved; if none is, the one tried last.
 
     First with P0 = diag{R0, 0}, which keeps the form diag{R, Q(s)} of Theorem 1; then with a full P0.
     """
-    model = error_model(problem, K_bar, H_bar)
+    model = error_model(problem, *stacked_links(problem, K, H))
     for form, t, candidate in _candidates(model, _lifted(P)):
-        gamma = least_gamma(model.M, candidate) * _ABOVE
-        tried = Confirmed(candidate, form, t, check(problem, K_bar, H_bar, P=candidate, gamma=gamma))
-        if tried.verdict.holds:
-            break
-    return tried
+        if satisfies_17(model, candidate):
+            confirmed = _prove(problem, K, H, model, candidate, form, t)
+            if confirmed.verdict.holds:
+                return confirmed
+    return _prove(problem, K, H, model, candidate, form, t)
 
 
-def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Literal["structured", "full"], float, Array]]:
+def _prove(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, model: ErrorModel, P: Array, form: Form, t: float
+) -> Confirmed:
+    gamma = least_gamma(model.M, P) * _ABOVE
+    return Confirmed(P, form, t, check(problem, K, H, P=P, gamma=gamma))
+
+
+def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Form, float, Array]]:
     yield "structured", 0.0, P
     P0 = plant_lyapunov(model, P)
     if P0 is not None:
@@ -58,6 +72,25 @@ def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Literal["structur
     if P0 is not None:
         for t in (1e-8, 1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3, 1e-2, 1e-1):
             yield "full", t, relaxed(model, P, P0, t)
+
+
+def least_gamma(M: Array, P: Array) -> float:
+    """The infimum of the gamma that satisfy (18): the root of max_s lambda_max(M P(s)^-1 M'); P positive definite."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(M @ np.linalg.solve(P_s, M.T)).max()) for P_s in P))
+
+
+def inequality_17(model: ErrorModel, P: Array) -> Array:
+    """Minus the matrix of (17) for every mode, (modes, n_eta + nw, n_eta + nw), in floats."""
+    operator = Operator(model)
+    S = -operator.joint(operator.bar(P))
+    S[:, : model.size, : model.size] += P
+    S[:, model.size :, model.size :] += np.eye(model.nw)
+    return np.asarray((S + S.swapaxes(1, 2)) / 2.0)
+
+
+def satisfies_17(model: ErrorModel, P: Array) -> bool:
+    """Whether floats take (17) for true: a cheap screen, no proof."""
+    return all(positive(P_s) for P_s in P) and all(positive(S) for S in inequality_17(model, P))
 
 
 def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
@@ -102,12 +135,10 @@ def corner(model: ErrorModel, P: Array) -> Array:
 
 def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:
     """(1 - t)(P + tau P0) with the tau of this module's first lines, for W = P."""
-    worst = 0.0
-    for s in range(len(P)):
-        P0_bar = np.tensordot(model.transition[s], P0, axes=1)
-        C = model.A[s].T @ P0_bar @ model.B[s]
-        grown = model.B[s].T @ P0_bar @ model.B[s] + 2.0 * C.T @ np.linalg.solve(P[s], C)
-        worst = max(worst, float(np.linalg.eigvalsh((grown + grown.T) / 2.0).max()))
+    operator, n = Operator(model), model.size
+    S = operator.joint(operator.bar(P0))
+    grown = S[:, n:, n:] + 2.0 * S[:, n:, :n] @ np.linalg.solve(P, S[:, :n, n:])
+    worst = float(np.linalg.eigvalsh((grown + grown.swapaxes(1, 2)) / 2.0).max())
     tau = t / (2.0 * worst) if worst > 0.0 else t
     return np.asarray((1.0 - t) * (P + tau * P0))
 

@@ -1,179 +1,131 @@
-"""The check of a certificate of kind "exact": gamma from a horizon T and a P, in float64 with allowances.
+"""A certificate of kind "exact" proved: gamma from a horizon T and a P, in ball arithmetic; docs/theory.md, section 4.
 
-(17) is one inequality between P(s) now and P(t) one step later. With two different P it reads
+1. (17) for P, and P > 0: the error system is mean-square stable, and E eta'P eta grows by |w|^2 a step at most.
+2. The tail: L^T(M'M) < tau^2 P, with some tau < gamma.
+3. The recursion of the exact gain from M'M over T steps at g = gamma^2 - tau^2: every W > 0, so gamma_T^2 <= g.
 
-    [P_next(s), 0; 0, I] - [A B]'P_bar[A B] - (losses) > 0,   called P -> P_next below.
-
-The proof has three parts, docs/theory.md says why they suffice:
-1. P -> P, which is (17);
-2. M'M/g = P_0 -> P_1 -> ... -> P_T, so gamma_T^2 <= g: the recursion of the exact gain, every P_k a little too large;
-3. L^T(M'M) <= tau^2 P, with every power of L a little too large.
-Then gamma^2 >= g + tau^2. Each step starts from stored numbers, so its rounding is bounded as that of (17) is.
+Then the exact gain is at most sqrt(g + tau^2) = gamma. Both sequences, of 2 and of 3, rise with what they start from.
+So after every step the matrix of balls is replaced by one of numbers that is provably not below it: what is proved is
+proved of more than the truth, and radii do not add up over the horizon. Where a part fails, the same with matrices
+that are not above the truth shows whether it is false.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
+from flint import arb, arb_mat
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError
-from agent.contract.gains import Gains
+from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.certificate import ARITHMETIC, Verdict, _allowance, _magnitudes, lyapunov_matrix
-from designer.error_model import error_model, stacked_gains
-from designer.gain import Operator
+from designer.ball_model import BallModel
+from designer.balls import UNDECIDED, Sign, above, below, floats, identity, part, sign
+from designer.certificate import Finding, Verdict, decided, inequality_17, symmetric
 
-_U = 2.0**-53
-_TOWARDS = 1.0 - 1e-12  # g is chosen this factor below gamma^2 - tau^2, which is itself rounded
+Modes = tuple[str, ...]
+Rounding = Callable[[arb_mat], arb_mat]  # above or below
 
-
-class _Step:
-    """P -> P_next for all modes: the matrices, and bounds on the rounding of their entries."""
-
-    def __init__(self, problem: Problem, K_bar: Array, H_bar: Array) -> None:
-        self.problem = problem
-        self.operator = Operator(error_model(problem, K_bar, H_bar))
-        self.sizes = Operator(_magnitudes(problem, K_bar, H_bar))
-
-    def joint(self, P: Array) -> tuple[Array, Array]:
-        """[A B]'P_bar[A B] with its losses, (modes, n_eta + nw, n_eta + nw), and its sums of absolute values."""
-        return self.operator.joint(self.operator.bar(P)), self.sizes.joint(self.sizes.bar(np.abs(P)))
-
-    def corner_above(self, P: Array) -> Array:
-        """A matrix that is not below L(P), for P positive semidefinite."""
-        n = self.operator.size
-        S, magnitude = self.joint(P)
-        return _raised(S[:, :n, :n], magnitude[:, :n, :n], _allowance(magnitude[:, :n, :n], self.problem))
-
-    def above(self, P: Array) -> Array | None:
-        """P_next that is mostly enough: what the recursion gives, raised by its rounding; None where W fails."""
-        n = self.operator.size
-        S, magnitude = self.joint(P)
-        W = np.eye(S.shape[1] - n) - S[:, n:, n:]
-        if not np.linalg.eigvalsh(W).min() > 0.0:
-            return None
-        grown = S[:, :n, :n] + S[:, :n, n:] @ np.linalg.solve(W, S[:, n:, :n])
-        worst_w = np.abs(np.linalg.solve(W, S[:, n:, :n]))
-        both = np.concatenate([np.broadcast_to(np.eye(n), grown.shape), worst_w], axis=1)
-        magnitude[:, n:, n:] += np.eye(len(W[0]))
-        lost = _allowance(magnitude, self.problem)
-        diagonal = np.arange(S.shape[1])
-        lost[:, diagonal, diagonal] += _cholesky_loss(len(S[0])) * magnitude[:, diagonal, diagonal]
-        lost = 16.0 * both.swapaxes(1, 2) @ lost @ both  # what is lost in W and A'P_bar B reaches P_next through w
-        return _raised(grown, magnitude[:, :n, :n], lost)
-
-    def margins(self, P: Array, P_next: Array) -> list[tuple[bool, float]]:
-        """For every mode: whether the inequality holds in exact arithmetic, and by how much."""
-        n = self.operator.size
-        S, magnitude = self.joint(P)
-        S, unit = -S, np.eye(S.shape[1] - n)
-        for matrix, part in ((S, P_next), (magnitude, np.abs(P_next))):
-            matrix[:, :n, :n] += part
-            matrix[:, n:, n:] += unit
-        return [_positive(S[s], magnitude[s], self.problem) for s in range(len(S))]
+_ROOM = 1e-6  # tau^2 stands this much above its computed value, relative to it,
+_LEAST_TAIL = 1e-20  # and this much of gamma^2 besides
 
 
-def verify_exact(gains: Gains) -> Verdict:
-    """Check everything as it stands in the gains file."""
-    proved = gains.certificate
-    if proved.horizon is None or proved.horizon < 1:
-        raise InputError(f'certificate: horizon is {proved.horizon}; kind "exact" needs the number of its steps')
-    K_bar, H_bar = stacked_gains(gains)
-    P = lyapunov_matrix(gains)
-    return check_exact(gains.problem, K_bar, H_bar, P=P, gamma=proved.gamma, horizon=proved.horizon)
+def check_exact(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, P: Array, gamma: float, horizon: int) -> Verdict:
+    """Whether gamma is proved for the gains of (5) by P (modes, n_eta, n_eta) and T = horizon."""
+
+    def findings() -> list[Finding]:
+        model, P_balls, modes, gamma2 = BallModel(problem, K, H), symmetric(P), problem.mode_names, arb(gamma) ** 2
+        found = inequality_17(model, modes, P_balls)
+        found += [
+            Finding("P > 0", mode, sign(P_s, floats(P_s).diagonal())) for mode, P_s in zip(modes, P_balls, strict=True)
+        ]
+        if not _proved(found):
+            return found
+        tail, tau2 = _tail(model, modes, P_balls, gamma2, horizon)
+        found += tail
+        if not _proved(found):
+            return found
+        return found + _recursion(model, modes, (gamma2 - tau2).lower(), horizon)
+
+    return decided(findings, gamma)
 
 
-def check_exact(problem: Problem, K_bar: Array, H_bar: Array, *, P: Array, gamma: float, horizon: int) -> Verdict:
-    """Whether gamma is proved by P (modes, n_eta, n_eta) and T = horizon."""
-    step = _Step(problem, K_bar, H_bar)
-    P = (P + P.swapaxes(-1, -2)) / 2.0
-    margins: dict[str, float] = {}
-    failure: str | None = None
-    for name, held, margin in _parts(step, P, gamma, horizon):
-        margins[name] = min(margin, margins.get(name, margin))
-        if not held:
-            failure = f"{name} fails: its least scaled eigenvalue is {margin:.3g} after the allowance for rounding"
-            break
-    return Verdict(failure is None, gamma, ARITHMETIC, failure, margins)
+def _tail(model: BallModel, modes: Modes, P: list[arb_mat], gamma2: arb, horizon: int) -> tuple[list[Finding], arb]:
+    """tau^2 P - L^T(M'M) > 0 in every mode, and tau^2, which is not above gamma^2."""
+    Z = _powers(model, horizon, above)
+    tau2 = arb(min(_relative(Z, P) * (1.0 + _ROOM) + _LEAST_TAIL * float(gamma2), float(gamma2.lower())))
+    at = f" after {horizon} steps against tau^2 = {float(tau2):.6g}, gamma^2 = {float(gamma2):.6g}"
+    found = [Finding("tail", mode, _less(Z_s, tau2, P_s), at) for mode, Z_s, P_s in zip(modes, Z, P, strict=True)]
+    if not _proved(found):
+        lower = _powers(model, horizon, below)
+        found = [
+            finding._replace(sign=finding.sign._replace(refuted=_less(Z_s, tau2, P_s).refuted))
+            for finding, Z_s, P_s in zip(found, lower, P, strict=True)
+        ]
+    return found, tau2
 
 
-def _parts(step: _Step, P: Array, gamma: float, horizon: int) -> Iterator[tuple[str, bool, float]]:
-    """Every inequality of the three parts: its name, whether it holds, its margin."""
-    modes = step.problem.mode_names
-    for mode, (held, margin) in zip(modes, step.margins(P, P), strict=True):
-        yield f"(17) mode {mode}", held, margin
-    least = float(np.linalg.eigvalsh(P).min())
-    if not least > 0.0:
-        yield "P > 0", False, least
-        return
-    MM = step.operator.MM
-    MM = _raised(MM, np.abs(MM), _allowance(np.abs(MM), step.problem))
-    Z = MM
+def _recursion(model: BallModel, modes: Modes, g: arb, horizon: int) -> list[Finding]:
+    """W > 0 in every mode at each of T steps, up to the first that fails."""
+    found = _sweep(model, modes, g, horizon, above)
+    if _proved(found):
+        return found
+    truth = _sweep(model, modes, g, horizon, below)[-1]
+    failed = truth if truth.sign.refuted else found[-1]._replace(sign=found[-1].sign._replace(refuted=False))
+    return [*found[:-1], failed]
+
+
+def _sweep(model: BallModel, modes: Modes, g: arb, horizon: int, rounded: Rounding) -> list[Finding]:
+    """Y <- L(Y) + A'Y_bar B W^-1 B'Y_bar A from M'M, W = g I - B'Y_bar B, with Y rounded to one side after a step."""
+    found: list[Finding] = []
+    Y = [rounded(model.MM)] * len(modes)
+    sizes = np.full(model.nw, float(g))
+    for step in range(1, horizon + 1):
+        at = f" at step {step} of {horizon}, counted from the last, with g = gamma^2 - tau^2 = {float(g):.6g}"
+        Y_next = []
+        for mode, S in zip(modes, model.joint(Y), strict=True):
+            W, cross = identity(model.nw) * g - part(S, model.w, model.w), part(S, model.eta, model.w)
+            found.append(Finding("recursion", mode, sign(W, sizes), at))
+            if not found[-1].sign.proved:
+                return found
+            try:
+                grown = part(S, model.eta, model.eta) + cross * W.solve(cross.transpose())
+            except ZeroDivisionError:  # too few bits
+                found[-1] = found[-1]._replace(sign=UNDECIDED)
+                return found
+            Y_next.append(rounded(grown))
+        Y = Y_next
+    return found
+
+
+def _powers(model: BallModel, horizon: int, rounded: Rounding) -> list[arb_mat]:
+    """L^T(M'M), rounded to one side after every step."""
+    Z = [rounded(model.MM) for _ in model.modes]
     for _ in range(horizon):
-        Z = step.corner_above(Z)
-    tau2 = _relative(Z, P)
-    for mode, Z_s, P_s in zip(modes, Z, P, strict=True):
-        matrix = tau2 * P_s - Z_s
-        held, margin = _positive(matrix, tau2 * np.abs(P_s) + np.abs(Z_s), step.problem)
-        yield f"tail mode {mode}", held, margin
-    g = (gamma**2 - tau2) * _TOWARDS
-    if not g > 0.0:
-        yield "gamma^2 above the tail", False, float(gamma**2 - tau2)
-        return
-    P_k = MM / g * (1.0 + 4.0 * _U)
-    for _ in range(horizon):
-        P_next = step.above(P_k)
-        pairs = step.margins(P_k, P_next) if P_next is not None else [(False, 0.0)] * len(modes)
-        for mode, (held, margin) in zip(modes, pairs, strict=True):
-            yield f"recursion mode {mode}", held, margin
-        if P_next is None:
-            return
-        P_k = P_next
+        Z = [rounded(part(S, model.eta, model.eta)) for S in model.joint(Z)]
+    return Z
 
 
-def _positive(S: Array, magnitude: Array, problem: Problem) -> tuple[bool, float]:
-    """Whether every symmetric matrix within the allowance of S is positive definite; and the margin.
+def _less(Z: arb_mat, tau2: arb, P: arb_mat) -> Sign:
+    """The sign of tau^2 P - Z."""
+    bound = P * tau2
+    return sign(bound - Z, floats(bound).diagonal())
 
-    As in designer.certificate, but scaled by the magnitudes: where S is small by cancellation, its rounding is not.
-    """
-    scale = _scale(magnitude)
-    both = scale * scale[:, None]
-    S, magnitude = S * both, magnitude * both
-    loss = _allowance(magnitude, problem).sum(axis=1) + _cholesky_loss(len(S)) * magnitude.diagonal().max()
-    lowered = S - np.diag(loss)
-    margin = float(np.linalg.eigvalsh(lowered).min())
+
+def _relative(Z: list[arb_mat], P: list[arb_mat]) -> float:
+    """The least tau^2 with Z <= tau^2 P in every mode, computed; infinity where floats do not tell."""
+    P_middle, Z_middle = np.array([floats(P_s) for P_s in P]), np.array([floats(Z_s) for Z_s in Z])
+    if not (np.isfinite(P_middle).all() and np.isfinite(Z_middle).all()):
+        return np.inf
     try:
-        np.linalg.cholesky(lowered)
+        L = np.linalg.cholesky(P_middle)
+        half = np.linalg.solve(L, Z_middle)
+        relative = np.linalg.solve(L, half.swapaxes(1, 2))
+        return max(float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max()), 0.0)
     except np.linalg.LinAlgError:
-        return False, min(margin, 0.0)
-    return True, margin
+        return np.inf
 
 
-def _raised(S: Array, magnitude: Array, allowance: Array) -> Array:
-    """S plus more than any symmetric error within the allowance, (modes, n_eta, n_eta); by Gershgorin, scaled."""
-    S = (S + S.swapaxes(1, 2)) / 2.0
-    scale = _scale(magnitude)
-    diagonal = np.arange(S.shape[1])
-    S[:, diagonal, diagonal] += 1.01 * (allowance @ scale[:, :, None])[:, :, 0] / scale
-    return np.asarray(S)
-
-
-def _scale(magnitude: Array) -> Array:
-    """Powers of two that bring the diagonal near 1, (..., order); 1 where it is 0."""
-    diagonal = np.diagonal(magnitude, axis1=-2, axis2=-1)
-    return np.asarray(np.exp2(np.round(-np.log2(np.where(diagonal > 0.0, diagonal, 1.0)) / 2.0)))
-
-
-def _cholesky_loss(order: int) -> float:
-    """How far a matrix of diagonal 1, whose Cholesky ends, may be from a positive semidefinite one (Rump, 2006)."""
-    return 4.0 * order * (order + 2) * _U
-
-
-def _relative(Z: Array, P: Array) -> float:
-    """A little more than the least tau^2 with Z <= tau^2 P."""
-    L = np.linalg.cholesky(P)
-    half = np.linalg.solve(L, np.linalg.solve(L, Z).swapaxes(1, 2))
-    largest = float(np.linalg.eigvalsh((half + half.swapaxes(1, 2)) / 2.0).max())
-    return largest * (1.0 + 1e-6) + np.finfo(float).tiny
+def _proved(found: list[Finding]) -> bool:
+    return all(finding.sign.proved for finding in found)

@@ -47,7 +47,7 @@ def design_exact(
     solved = time.perf_counter()
     chosen = descent.chosen
     K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
-    certificate = certify(problem, *stacked_links(problem, K, H))
+    certificate = certify(problem, K, H)
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
@@ -105,15 +105,15 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     return starts, solution.gamma
 
 
-def certify(problem: Problem, K_bar: Array, H_bar: Array) -> Certificate:
-    """gamma just above the exact gain of any gains, as the check confirms it; or Unattainable."""
-    gain = exact_gain(error_model(problem, K_bar, H_bar))
+def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
+    """gamma just above the exact gain of any gains of (5), proved; or Unattainable."""
+    gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
     if gain.P is None:
         raise Unattainable(
             f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
             "in each step; peakmesh design PROBLEM --method theorem2 gives stable ones"
         )
-    verdict = _confirmed(problem, K_bar, H_bar, gain, gain.P)
+    verdict = _confirmed(problem, K, H, gain, gain.P)
     if not verdict.holds:
         raise Unattainable(
             f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
@@ -133,10 +133,10 @@ def certify(problem: Problem, K_bar: Array, H_bar: Array) -> Certificate:
     )
 
 
-def _confirmed(problem: Problem, K_bar: Array, H_bar: Array, gain: Gain, P: Array) -> Verdict:
+def _confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, P: Array) -> Verdict:
     for factor in _ABOVE:
         gamma = gain.high * factor
-        verdict = check_exact(problem, K_bar, H_bar, P=P, gamma=gamma, horizon=gain.horizon)
+        verdict = check_exact(problem, K, H, P=P, gamma=gamma, horizon=gain.horizon)
         if verdict.holds:
             break
     return verdict

@@ -13,11 +13,11 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.back_off import Confirmed, back_off, positive
-from designer.certificate import check, least_gamma
+from designer.back_off import Confirmed, back_off, least_gamma, satisfies_17
+from designer.certificate import check
 from designer.descent import Progress
 from designer.effort import default_method
-from designer.error_model import link_gains, stacked_links, stacks
+from designer.error_model import error_model, link_gains, stacked_links
 from designer.exact_design import design_exact, with_ladder
 from designer.inwards import inwards
 from designer.lmi import LmiSolution
@@ -98,8 +98,7 @@ def block_diagonal(R: Array, Q: Array) -> Array:
 def _confirm(problem: Problem, solution: LmiSolution) -> Designed:
     """The solver's own gains; their P and gamma backed off until the check confirms them; or Unattainable."""
     K, H = _links(problem, solution)
-    # the check sees the gains as a reader of the file will have them
-    confirmed = back_off(problem, *stacked_links(problem, K, H), block_diagonal(solution.R, solution.Q))
+    confirmed = back_off(problem, K, H, block_diagonal(solution.R, solution.Q))
     if not confirmed.verdict.holds:
         raise _unconfirmed(problem, solution, confirmed.verdict.failure)
     return Designed(K, H, confirmed)
@@ -110,15 +109,15 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
 
     For an unstable plant the answer itself has something to spare: the LMI was solved with a margin.
     """
-    M = np.hstack([np.zeros((problem.n * problem.nz, len(solution.R))), stacks(problem).M])
     for t in STEPS_INWARDS if spectral_radius(problem) < 1.0 else (0.0,):
         moved = inwards(problem, solution, t) if t else solution
         K, H = _links(problem, moved)
         P = block_diagonal(moved.R, moved.Q)
-        if not all(positive(P_s) for P_s in P):
+        model = error_model(problem, *stacked_links(problem, K, H))
+        if not satisfies_17(model, P):
             continue
-        gamma = least_gamma(M, P) * (1.0 + 1e-9 + t / 100.0)  # so that (18) is strict
-        verdict = check(problem, *stacked_links(problem, K, H), P=P, gamma=gamma)
+        gamma = least_gamma(model.M, P) * (1.0 + 1e-9 + t / 100.0)  # so that (18) is strict
+        verdict = check(problem, K, H, P=P, gamma=gamma)
         if verdict.holds:
             return Designed(K, H, Confirmed(P, "structured", t, verdict))
     return None

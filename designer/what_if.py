@@ -17,8 +17,9 @@ import numpy as np
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
+from designer.back_off import least_gamma
 from designer.barrier import StackedGains
-from designer.certificate import least_gamma, lyapunov_matrix
+from designer.certificate import lyapunov_matrix
 from designer.effort import default_method
 from designer.error_model import error_model, stacked_gains, stacked_links
 from designer.gain import exact_gain

@@ -29,6 +29,12 @@ WHO_MAY_IMPORT = {
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
     "scipy": ["designer/lmi/"],
+    "flint": [
+        "designer/balls.py",
+        "designer/ball_model.py",
+        "designer/certificate.py",
+        "designer/exact_certificate.py",
+    ],
     "matplotlib": ["designer/figures.py"],
     "rich": ["agent/cli.py", "designer/commands/"],
     "distributed": ["designer/workers.py"],
@@ -172,13 +178,14 @@ def loaded(modules: str) -> set[str]:
         ("agent.cli, agent.launch", "cvxpy clarabel scipy designer matplotlib rich mcap zenoh"),
         ("agent.cli, agent.bus, agent.roles.recorder", "cvxpy clarabel scipy designer matplotlib rich"),
         # the command line, before it knows what to do
-        ("designer.cli", "numpy zenoh mcap cvxpy clarabel scipy matplotlib rich"),
+        ("designer.cli", "numpy zenoh mcap cvxpy clarabel scipy flint matplotlib rich"),
         # replay: nothing of the nodes' arithmetic, no network
-        ("designer.replay", "agent.filter agent.inbox agent.roles agent.bus zenoh cvxpy clarabel scipy matplotlib"),
+        ("designer.replay",
+         "agent.filter agent.inbox agent.roles agent.bus zenoh cvxpy clarabel scipy flint matplotlib"),
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver
-        ("designer.certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
+        ("designer.certificate, designer.exact_certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
     ],
 )  # fmt: skip
 def test_a_process_loads_only_what_it_needs(modules: str, never: str) -> None:

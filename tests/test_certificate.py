@@ -1,42 +1,97 @@
-"""The check of Theorem 1, and mutants of a good certificate that it must refuse."""
+"""The proof of certificates of both kinds, and mutants of good ones that it must refuse."""
 
 from __future__ import annotations
 
 import copy
+import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
-from networks import random_gains, random_problem
+from flint import arb, arb_mat, ctx
+from networks import random_gains, random_problem, real_network
 
-from agent.contract.errors import InputError
-from agent.contract.gains import Gains
+from agent.contract.arrays import Array
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
+from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.back_off import back_off, coupled_lyapunov
-from designer.certificate import check, inequality_17, inequality_18, least_gamma, lyapunov_matrix, verify
-from designer.error_model import error_model, stacked_gains
+from designer import balls, certificate
+from designer.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
+from designer.ball_model import BallModel, Noise, Sensor
+from designer.balls import above, below, exact, floats, sign
+from designer.certificate import check, lyapunov_matrix, verify
+from designer.cli import main
+from designer.consensus import consensus_gains
+from designer.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
+from designer.gain import Operator, exact_gain
 from designer.problems import find
-from designer.synthesis import design
 
 Document = dict[str, Any]
+Kind = Literal["lyapunov", "exact"]
+GOLDEN = Path(__file__).parents[1] / "recordings/golden/zhu2020-lossy.gains.json"
 
 
-@pytest.fixture(scope="module")
-def gains() -> Gains:
-    """A certificate with P in full."""
-    designed = design(find("zhu2020-lossy"), method="theorem2-reduced")
-    P = dict(zip(designed.problem.mode_names, lyapunov_matrix(designed), strict=True))
-    proved = designed.certificate.model_copy(update={"form": "full", "P": P, "R": None, "Q": None})
-    return designed.model_copy(update={"certificate": proved})
+def networks() -> dict[str, Problem]:
+    """The paper's; one that sees some losses and loses messages; one with an unstable plant, without x."""
+    return {
+        "paper": find("zhu2020-lossy"),
+        "real": real_network(random_problem(3), seen=["n1"], delivery=0.8),
+        "unbiased": real_network(random_problem(4), seen=True, delivery=0.9, unbiased=True, radius=1.02),
+        "unbiased-hidden": real_network(random_problem(6), delivery=0.9, unbiased=True),
+    }
 
 
-@pytest.fixture(scope="module")
-def structured() -> Gains:
-    return design(find("zhu2020-ideal"), method="theorem2")
+def model_of(gains: Gains) -> ErrorModel:
+    return error_model(gains.problem, *stacked_gains(gains))
+
+
+def unbiased_gains(problem: Problem) -> tuple[Array, Array]:
+    """Kalman-consensus gains of the plant at a radius of 0.9 at most; what A has more goes to K_ii."""
+    stable = problem
+    if not problem.carries_plant:
+        stable = real_network(problem, radius=0.9)
+    K_bar, H_bar = consensus_gains(stable, weight=0.2)
+    return K_bar + np.kron(np.eye(problem.n), problem.plant.A - stable.plant.A), H_bar
+
+
+def certified(problem: Problem, kind: Kind) -> Gains:
+    """Kalman-consensus gains with a certificate as tight as `design` makes it, by floats alone."""
+    K, H = link_gains(problem, *unbiased_gains(problem))
+    model = error_model(problem, *stacked_links(problem, K, H))
+    gain = exact_gain(model)
+    assert gain.P is not None
+    gamma = gain.high if kind == "exact" else least_gamma(model.M, gain.P) * (1.0 + 1e-9)
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method="consensus",
+        K=K,
+        H=H,
+        certificate=Certificate(
+            gamma=gamma,
+            kind=kind,
+            form="full",
+            P=dict(zip(problem.mode_names, gain.P, strict=True)),
+            horizon=gain.horizon if kind == "exact" else None,
+            exact=(gain.low, gain.high),
+            holds=True,
+            verified="by nobody yet",
+            margins={},
+        ),
+        solver=Solver(name="none", version="0", status="none", iterations=0, seconds=0.0),
+        seconds={},
+    )
+
+
+KINDS: tuple[Kind, ...] = ("lyapunov", "exact")
+ALL = {(name, kind): certified(problem, kind) for name, problem in networks().items() for kind in KINDS}
+every_network = pytest.mark.parametrize("network", list(networks()))
+every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def mutated(gains: Gains, mutate: Callable[[Document], None]) -> Gains:
@@ -47,130 +102,417 @@ def mutated(gains: Gains, mutate: Callable[[Document], None]) -> Gains:
     return Gains.model_validate(document)
 
 
+# mutants
 def lower_gamma(document: Document) -> None:
-    document["certificate"]["gamma"] *= 1.0 - 1e-6
+    proved = document["certificate"]
+    proved["gamma"] = (proved["exact"][0] if proved["kind"] == "exact" else proved["gamma"]) * (1.0 - 1e-5)
 
 
 def change_one_gain(document: Document) -> None:
-    document["K"]["3"]["2"]["1"][0][1] += 0.5
+    mode = document["problem"]["topology"][1]["name"]
+    receiver, heard = next((i, heard) for i, heard in document["K"][mode].items() if len(heard) > 1)
+    sender = next(j for j in heard if j != receiver)
+    document["K"][mode][receiver][sender][0][1] += 1.0
+    if document["problem"].get("unbiased"):  # A = sum of a_ij K_ij still
+        names = [node["name"] for node in document["problem"]["node"]]
+        a = dict(zip(names, document["problem"]["topology"][1]["adjacency"][names.index(receiver)], strict=True))
+        document["K"][mode][receiver][receiver][0][1] -= a[sender] / a[receiver]
 
 
 def change_one_measurement_gain(document: Document) -> None:
-    document["H"]["2"]["4"]["3"][0][0] += 0.5
+    mode, receiver = (document["problem"][part][0]["name"] for part in ("topology", "node"))
+    document["H"][mode][receiver][receiver][0][0] += 1.5
 
 
 def swap_arrival_and_loss(document: Document) -> None:
     for node in document["problem"]["node"]:
-        node["arrival_probability"] = 1.0 - node["arrival_probability"]
+        beta = node["arrival_probability"]
+        node["arrival_probability"] = 1.0 - beta if beta < 1.0 else beta
 
 
-def permute_modes_of_P(document: Document) -> None:
-    P = document["certificate"]["P"]
-    document["certificate"]["P"] = {"1": P["2"], "2": P["3"], "3": P["4"], "4": P["1"]}
+def permute_modes(document: Document) -> None:
+    P, modes = document["certificate"]["P"], list(document["certificate"]["P"])
+    document["certificate"]["P"] = {mode: P[modes[k - 1]] for k, mode in enumerate(modes)}
 
 
 def change_transition(document: Document) -> None:
-    document["problem"]["markov"]["transition"] = np.eye(4)[[1, 0, 3, 2]].tolist()
+    modes = len(document["problem"]["topology"])
+    document["problem"]["markov"]["transition"] = np.roll(np.eye(modes), 1, axis=0).tolist()
 
 
 def make_P_indefinite(document: Document) -> None:
-    P = document["certificate"]["P"]["4"]
+    P = next(iter(document["certificate"]["P"].values()))
     P[0][0] = -P[0][0]
 
 
 def scale_P_up(document: Document) -> None:
     P = document["certificate"]["P"]
-    document["certificate"]["P"] = {mode: (1.0001 * np.array(matrix)).tolist() for mode, matrix in P.items()}
+    document["certificate"]["P"] = {mode: (1.01 * np.array(matrix)).tolist() for mode, matrix in P.items()}
+
+
+def shorten_horizon(document: Document) -> None:
+    if document["certificate"]["horizon"] is not None:
+        document["certificate"]["horizon"] //= 2
+
+
+def cut_horizon(document: Document) -> None:
+    if document["certificate"]["horizon"] is not None:
+        document["certificate"]["horizon"] = 1
 
 
 MUTANTS = [
-    (lower_gamma, "(18)"),
-    (change_one_gain, "(17)"),
-    (change_one_measurement_gain, "(17)"),
-    (swap_arrival_and_loss, "(17)"),
-    (permute_modes_of_P, "(1"),
-    (change_transition, "(17)"),
-    (make_P_indefinite, "(1"),
-    (scale_P_up, "(17)"),
+    change_one_gain,
+    change_one_measurement_gain,
+    swap_arrival_and_loss,
+    permute_modes,
+    change_transition,
+    make_P_indefinite,
+    scale_P_up,
 ]
 
 
-def test_the_designed_gains_hold_after_a_round_trip_through_the_file(gains: Gains, structured: Gains) -> None:
-    """What design saves, verify confirms, with every margin positive, for both forms of P."""
-    assert gains.certificate.form == "full"
-    assert structured.certificate.form == "structured"
-    for designed in (gains, structured):
-        verdict = verify(Gains.from_bytes(designed.canonical(), source="memory"))
-        assert verdict.holds
-        assert verdict.failure is None
-        assert verdict.gamma == designed.certificate.gamma
-        assert set(verdict.margins) == {f"({i}) mode {s}" for i in (17, 18) for s in "1234"}
-        assert min(verdict.margins.values()) > 0.0
+@every_kind
+@every_network
+def test_true_certificates_are_proved(network: str, kind: Kind) -> None:
+    """As tight as they are made, with every margin positive, through the bytes of the file."""
+    gains = ALL[network, kind]
+    verdict = verify(Gains.from_bytes(gains.canonical(), source="memory"))
+    assert verdict.holds, verdict.failure
+    assert verdict.failure is None
+    assert verdict.gamma == gains.certificate.gamma
+    parts = ["(17)", "(18)"] if kind == "lyapunov" else ["(17)", "P > 0", "tail", "recursion"]
+    assert set(verdict.margins) == {f"{part} mode {mode}" for part in parts for mode in gains.problem.mode_names}
+    assert min(verdict.margins.values()) > 0.0
 
 
-@pytest.mark.parametrize(("mutate", "inequality"), MUTANTS)
-def test_a_mutant_fails_and_the_failure_names_inequality_and_mode(
-    gains: Gains, mutate: Callable[[Document], None], inequality: str
-) -> None:
-    """Any edit that breaks Theorem 1 gives a verdict with holds = False, not an exception."""
-    verdict = verify(mutated(gains, mutate))
+def test_the_golden_gains_are_proved() -> None:
+    """P in structured form, as a solver gave it and the back-off left it."""
+    gains = Gains.load(GOLDEN)
+    assert gains.certificate.form == "structured"
+    assert verify(gains).holds
+
+
+@every_network
+def test_gamma_lowered_by_1e_5_is_proved_false(network: str) -> None:
+    """Below the infimum for this P, (18) is false; below the exact gain, the recursion is."""
+    for kind, inequality in (("lyapunov", "(18)"), ("exact", "recursion")):
+        verdict = verify(mutated(ALL[network, kind], lower_gamma))
+        assert not verdict.holds
+        assert verdict.failure is not None
+        assert verdict.failure.startswith(f'{inequality} fails in mode "')
+        assert "it is false, its least scaled eigenvalue is -" in verdict.failure
+        assert ("at step" in verdict.failure) is (kind == "exact")
+        assert min(verdict.margins.values()) < 0.0
+
+
+@every_kind
+@every_network
+@pytest.mark.parametrize("mutate", MUTANTS)
+def test_a_mutant_that_breaks_17_is_proved_false(network: str, kind: Kind, mutate: Callable[[Document], None]) -> None:
+    """(17) is false for the mutant by floats too; the verdict is a value, not an exception, and names the mode."""
+    mutant = mutated(ALL[network, kind], mutate)
+    P = lyapunov_matrix(mutant)
+    by_floats = np.linalg.eigvalsh(inequality_17(model_of(mutant), (P + P.swapaxes(1, 2)) / 2.0)).min(axis=1)
+    false = [mode for mode, least in zip(mutant.problem.mode_names, by_floats, strict=True) if least < 0.0]
+    assert false, "this mutant is no mutant"
+    verdict = verify(mutant)
     assert not verdict.holds
     assert verdict.failure is not None
-    assert verdict.failure.startswith(f"inequality {inequality}")
-    assert "mode" in verdict.failure
-    assert min(verdict.margins.values()) <= 0.0
+    assert verdict.failure.startswith(f'(17) fails in mode "{false[0]}": it is false, its least scaled eigenvalue is -')
+    assert min(verdict.margins.values()) < 0.0
 
 
-def test_a_certificate_without_its_matrices_is_malformed_input(structured: Gains) -> None:
+@every_network
+def test_a_horizon_that_is_too_short_is_refused(network: str) -> None:
+    """After one step the tail alone is above gamma^2; after half of the horizon it leaves too little for the rest."""
+    for mutate in (cut_horizon, shorten_horizon):
+        verdict = verify(mutated(ALL[network, "exact"], mutate))
+        assert not verdict.holds
+        assert verdict.failure is not None
+        assert verdict.failure.startswith(("tail fails", "recursion fails"))
+        assert "it is false" in verdict.failure
+    with pytest.raises(InputError, match="horizon is 0"):
+        verify(mutated(ALL[network, "exact"], lambda document: document["certificate"].update(horizon=0)))
+
+
+def test_a_tail_above_gamma_is_named() -> None:
+    verdict = verify(mutated(ALL["paper", "exact"], cut_horizon))
+    assert verdict.failure is not None
+    assert verdict.failure.startswith("tail fails")
+    assert "after 1 steps against tau^2" in verdict.failure
+
+
+@every_kind
+def test_gains_whose_bound_is_false_are_refused_whatever_P_is(kind: Kind) -> None:
+    """One gain is changed and P made anew: (17) is true again, and gamma, which was true before, is not."""
+    mutant = mutated(ALL["real", kind], change_one_measurement_gain_a_little)
+    gain = exact_gain(model_of(mutant))
+    assert gain.P is not None
+    assert gain.low > ALL["real", "exact"].certificate.gamma, "this mutant is no mutant"
+    P = dict(zip(mutant.problem.mode_names, gain.P, strict=True))
+    horizon = gain.horizon if kind == "exact" else None
+    proved = mutant.certificate.model_copy(update={"P": P, "horizon": horizon})
+    verdict = verify(mutant.model_copy(update={"certificate": proved}))
+    assert verdict.failure is not None
+    assert verdict.failure.startswith("(18)" if kind == "lyapunov" else "recursion")
+    assert "it is false" in verdict.failure
+    assert min(margin for name, margin in verdict.margins.items() if "(17)" in name) > 0.0
+
+
+def change_one_measurement_gain_a_little(document: Document) -> None:
+    mode, receiver = (document["problem"][part][0]["name"] for part in ("topology", "node"))
+    document["H"][mode][receiver][receiver][0][0] -= 0.2
+
+
+def test_an_edited_problem_is_refused() -> None:
+    """Without a new digest the file is not even read."""
+    document = copy.deepcopy(ALL["paper", "exact"].document())
+    document["problem"]["node"][0]["arrival_probability"] = 0.8
+    with pytest.raises(InputError, match="the problem was edited afterwards"):
+        Gains.from_bytes(json.dumps(document).encode(), source="memory")
+
+
+def test_a_certificate_without_its_matrices_is_malformed_input() -> None:
     """A missing Q of one node is bad input, named; so is a P of the wrong size."""
+    golden = Gains.load(GOLDEN)
     with pytest.raises(InputError, match='Q of mode 2 lacks "3"'):
-        verify(mutated(structured, lambda document: document["certificate"]["Q"]["2"].pop("3")))
+        verify(mutated(golden, lambda document: document["certificate"]["Q"]["2"].pop("3")))
     with pytest.raises(InputError, match="it must be 2 x 2"):
-        verify(mutated(structured, lambda document: document["certificate"].update(R=[[1.0]])))
+        verify(mutated(golden, lambda document: document["certificate"].update(R=[[1.0]])))
 
 
-def test_the_check_is_theorem_1_as_printed(gains: Gains) -> None:
-    """Positive definite matrices of the check are negative definite matrices (17) and (18)."""
-    problem, P, gamma = gains.problem, lyapunov_matrix(gains), gains.certificate.gamma
-    model = error_model(problem, *stacked_gains(gains))
-    for s in range(4):
-        A, B, M = model.A[s], model.B[s], model.M
-        P_bar = sum(problem.markov.transition[s, t] * P[t] for t in range(4))
-        lost = sum(
-            model.alpha[i] * model.F_i(s, i)[:, : model.size].T @ P_bar @ model.F_i(s, i)[:, : model.size]
-            for i in range(4)
-        )
-        printed = np.block(
-            [[A.T @ P_bar @ A + lost - P[s], A.T @ P_bar @ B], [B.T @ P_bar @ A, B.T @ P_bar @ B - np.eye(1)]]
-        )
-        np.testing.assert_allclose(inequality_17(model, s, P), -printed, atol=1e-12 * np.abs(P).max())
-        printed_18 = np.block([[-P[s], M.T], [M, -(gamma**2) * np.eye(len(M))]])
-        assert np.linalg.eigvalsh(printed_18).max() < 0.0
-        assert np.linalg.eigvalsh(inequality_18(model, s, P, gamma)).min() > 0.0
+# the checker has teeth: with a part of the model taken away, what is false passes
+@pytest.mark.parametrize(
+    ("network", "kept"),
+    [("paper", "nothing"), *((name, kept) for name in list(networks())[1:] for kept in ("losses", "links", "nothing"))],
+)
+def test_without_some_chance_a_false_certificate_would_pass(
+    network: str, kept: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """P and gamma made for errors without some of their chance are proved once the checker forgets that chance too."""
+    gains, model = ALL[network, "exact"], model_of(ALL[network, "exact"])
+    without: dict[str, Any] = {"losses": {"links": None}, "links": {"alpha": 0.0 * model.alpha}}
+    if kept == "links" and model.links is not None:
+        links = model.links
+        without["links"]["links"] = replace(links, variance=np.where(links.with_loss, 0.0, links.variance))
+    without["nothing"] = without["losses"] | {"alpha": 0.0 * model.alpha}
+    gain = exact_gain(replace(model, **without[kept]))
+    assert gain.P is not None
+    P = dict(zip(gains.problem.mode_names, gain.P, strict=True))
+    updated = {"P": P, "gamma": gain.high * (1.0 + 1e-6), "horizon": gain.horizon}
+    false = gains.model_copy(update={"certificate": gains.certificate.model_copy(update=updated)})
+    assert not verify(false).holds
+    monkeypatch.setattr("designer.exact_certificate.BallModel", forgetful(kept))
+    assert verify(false).holds
 
 
-def test_least_gamma_is_where_18_turns() -> None:
-    """(18) holds just above the least gamma and fails just below."""
-    problem = random_problem(3)
-    K_bar, H_bar = random_gains(problem, 3, size=0.1)
+def forgetful(kept: str) -> type[BallModel]:
+    """The checker's model with only some of its noise."""
+
+    class Forgetful(BallModel):
+        def _sensor(self, problem: Problem, j: int) -> Sensor:
+            sensor = super()._sensor(problem, j)
+            return sensor if kept == "losses" else sensor._replace(alpha=arb(0))
+
+        def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> tuple[arb_mat, list[Noise]]:
+            AB, noise = super()._mode(problem, s, K, H)
+            of_sensors = sum(sensor.alpha > 0 for sensor in self.sensors)  # they come last
+            return AB, noise if kept == "links" else noise[len(noise) - of_sensors :]
+
+    return Forgetful
+
+
+def test_the_implied_gain_counts_not_the_stored_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unbiased nodes step by a_ii K_ii = A - sum of the others, so K_ii of the file changes nothing."""
+    gains = ALL["unbiased", "lyapunov"]
+    K = copy.deepcopy(gains.K)
+    for links in K.values():
+        for receiver, heard in links.items():
+            heard[receiver] = heard[receiver] + 1e-3
+    model, other = (BallModel(gains.problem, stored, gains.H) for stored in (gains.K, K))
+    assert all(a.overlaps(b) for a, b in zip(model.AB, other.AB, strict=True))
+    biased = ALL["real", "lyapunov"]
+    K = copy.deepcopy(biased.K)
+    K["m0"]["n0"]["n0"] = K["m0"]["n0"]["n0"] + 1e-3
+    model, other = (BallModel(biased.problem, stored, biased.H) for stored in (biased.K, K))
+    assert not model.AB[0].overlaps(other.AB[0])
+
+
+# the model in balls
+VARIANTS = [
+    {"seen": seen, "delivery": delivery, "unbiased": unbiased}
+    for seen in (False, ["n1"], True)
+    for delivery in (None, 0.75)
+    for unbiased in (False, True)
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_both_error_models_are_one(variant: dict[str, Any]) -> None:
+    """Link by link in balls and by stacked matrices in floats, written independently: midpoints within rounding."""
+    problem = real_network(random_problem(7, n=4), **variant)
+    K_bar, H_bar = random_gains(problem, 7)
+    if problem.unbiased:
+        blocks = K_bar.reshape(2, problem.n, problem.nx, problem.n, problem.nx)
+        for i in range(problem.n):
+            blocks[:, i, :, i] += problem.plant.A - blocks[:, i].sum(axis=2)
     model = error_model(problem, K_bar, H_bar)
-    P = np.array([(s + 1.0) * np.diag(1.0 + np.arange(len(model.A[0]))) for s in range(2)])
-    gamma = least_gamma(model.M, P)
-    for factor, holds in ((1.0 + 1e-6, True), (1.0 - 1e-6, False)):
-        verdict = check(problem, K_bar, H_bar, P=P, gamma=factor * gamma)
-        assert all((verdict.margins[f"(18) mode m{s}"] > 0.0) for s in range(2)) is holds
+    operator = Operator(model)
+    Y = np.random.default_rng(7).normal(size=(2, model.size, model.size))
+    Y += Y.swapaxes(1, 2)
+    ball_model = BallModel(problem, *link_gains(problem, K_bar, H_bar))
+    joint = np.array([floats(S) for S in ball_model.joint([exact(Y_s) for Y_s in Y])])
+    np.testing.assert_allclose(joint, operator.joint(operator.bar(Y)), rtol=0, atol=1e-13 * np.abs(joint).max())
+    np.testing.assert_allclose([floats(AB) for AB in ball_model.AB], operator.AB, rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(floats(ball_model.M), model.M)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_gains_without_any_lmi_get_a_certificate_from_the_lyapunov_equation(seed: int) -> None:
+# signs
+def with_eigenvalues(values: list[float], seed: int) -> tuple[arb_mat, Array]:
+    """A symmetric matrix of these eigenvalues but for roundings of 2^-100, exactly as stored; and its diagonal."""
+    with ctx.workprec(100):
+        rng = np.random.default_rng(seed)
+        S, order = exact(np.diag(values)), len(values)
+        for _ in range(3):  # reflections by rational vectors, exactly orthogonal but for the 100 bits
+            v = exact(rng.integers(-9, 10, size=(order, 1)).astype(float))
+            length = (v.transpose() * v)[0, 0]
+            reflection = balls.identity(order) - v * v.transpose() * (2 / length)
+            S = reflection * S * reflection
+        S = ((S + S.transpose()) * arb(0.5)).mid()
+    return S, np.ones(order)
+
+
+@pytest.mark.parametrize("least", [1e-3, 1e-12, 1e-20, 1e-24])
+def test_the_sign_of_a_matrix_is_found_far_below_what_floats_resolve(least: float) -> None:
+    """Positive: proved. Its negative counterpart: proved false. Neither is ever said of the other."""
+    for seed in range(5):
+        positive = sign(*with_eigenvalues([1.0, 0.7, 0.7, 2.0, 1.5, least], seed))
+        assert positive.proved
+        assert not positive.refuted
+        assert positive.least == pytest.approx(least, rel=1e-2)
+        negative = sign(*with_eigenvalues([1.0, 0.7, 0.7, 2.0, 1.5, -least], seed))
+        assert negative.refuted
+        assert not negative.proved
+        assert negative.least == pytest.approx(-least, rel=1e-2)
+
+
+def test_a_singular_matrix_has_neither_sign() -> None:
+    """vv' is not positive definite, and no direction shows it: both answers would be wrong."""
+    v = np.random.default_rng(1).integers(-9, 10, size=(5, 3)).astype(float)
+    found = sign(exact(v @ v.T), (v @ v.T).diagonal())
+    assert not found.proved
+    assert not found.refuted
+
+
+def test_radii_count() -> None:
+    """The midpoint alone is positive definite, and stays so with small radii; with larger ones nothing is said."""
+    for radius, proved in ((1e-6, True), (1e-3, False)):
+        S = arb_mat(2, 2, [arb(1, radius), arb(0.999, radius), arb(0.999, radius), arb(1, radius)])
+        found = sign(S, np.ones(2))
+        assert found.proved is proved
+        assert not found.refuted
+
+
+def test_what_overflows_is_left_undecided() -> None:
+    """Numbers outside the range of floats are no sign and no exception."""
+    found = sign(exact(np.eye(2)) * arb(2) ** 5000, np.full(2, np.inf))
+    assert found == balls.UNDECIDED
+
+
+def test_above_and_below_enclose_every_matrix_of_the_ball() -> None:
+    """Radius 0, symmetric, and on its side of extreme members of the ball."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        Y = rng.normal(size=(4, 4))
+        Y += Y.T
+        radii = np.exp2(-rng.integers(1, 30, size=(4, 4)))
+        radii = np.maximum(radii, radii.T)
+        ball = arb_mat(4, 4, [arb(m, r) for m, r in zip(Y.ravel().tolist(), radii.ravel().tolist(), strict=True)])
+        signs = np.sign(rng.normal(size=4))
+        upper, lower = above(ball), below(ball)
+        for matrix in (upper, lower):
+            assert all(entry.rad() == 0 for entry in matrix.entries())
+            assert (floats(matrix) == floats(matrix).T).all()
+        extreme = radii * signs * signs[:, None]  # its largest eigenvalue is the largest of all, up to the signs
+        assert sign(upper - exact(Y + extreme) + balls.identity(4) * arb(2) ** -60, np.ones(4)).proved
+        assert sign(exact(Y - extreme) - lower + balls.identity(4) * arb(2) ** -60, np.ones(4)).proved
+
+
+def test_too_few_bits_are_doubled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(18) with 1e-9 to spare cannot be told with 20 bits: not proved with those alone, proved with more."""
+    gains = ALL["paper", "lyapunov"]
+    monkeypatch.setattr(certificate, "BITS", (20,))
+    verdict = verify(gains)
+    assert not verdict.holds
+    assert verdict.failure is not None
+    assert "it is not proved" in verdict.failure
+    assert "which 20 bits leave open" in verdict.failure
+    assert min(verdict.margins.values()) <= 0.0
+    monkeypatch.setattr(certificate, "BITS", (20, 128))
+    verdict = verify(gains)
+    assert verdict.holds
+    assert "128 bits" in verdict.arithmetic
+
+
+def test_what_is_singular_in_exact_arithmetic_is_not_proved_and_not_refuted() -> None:
+    """P = M'M / gamma^2 on one state meets (18) with equality; with 1e-12 to spare it is proved, or proved false."""
+    problem = find("two-nodes")
+    K, H = link_gains(problem, np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))
+    P = np.diag([2.0**-6, 2.0**-12, 2.0**-12])[None]
+    for spare, text in ((0.0, "it is not proved"), (1e-12, None), (-1e-12, "it is false")):
+        verdict = check(problem, K, H, P=P, gamma=2.0**6 * (1.0 + spare))
+        assert verdict.holds is (text is None), verdict
+        assert text is None or f'(18) fails in mode "linked": {text}' in str(verdict.failure)
+
+
+# backing off
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("real", [False, True])
+def test_gains_without_any_lmi_get_a_certificate_from_the_lyapunov_equation(seed: int, real: bool) -> None:
     """For mean-square stable gains a small enough multiple of P0 satisfies (17), so the back-off has a start."""
     problem = random_problem(seed)
+    if real:
+        problem = real_network(problem, seen=True, delivery=0.9)
     K_bar, H_bar = random_gains(problem, seed, size=0.1)
     model = error_model(problem, K_bar, H_bar)
     P0 = coupled_lyapunov(model, np.tile(np.eye(len(model.A[0])), (2, 1, 1)))
     assert P0 is not None
-    confirmed = back_off(problem, K_bar, H_bar, 1e-3 * P0 / np.abs(P0).max())
+    confirmed = back_off(problem, *link_gains(problem, K_bar, H_bar), 1e-3 * P0 / np.abs(P0).max())
     assert confirmed.verdict.holds
+
+
+@every_network
+def test_a_P_that_misses_17_by_a_little_is_backed_off(network: str) -> None:
+    """P on the boundary of (17), moved 1e-9 out of it: what comes back is proved, and gamma hardly grew."""
+    gains = ALL[network, "lyapunov"]
+    problem, K, H, model = gains.problem, gains.K, gains.H, model_of(gains)
+    P = np.array([gains.certificate.P[mode] for mode in problem.mode_names])  # type: ignore[index]
+    inside, outside = 1.0, 2.0
+    for _ in range(60):
+        middle = (inside + outside) / 2.0
+        inside, outside = (
+            (middle, outside) if np.linalg.eigvalsh(inequality_17(model, middle * P)).min() > 0.0 else (inside, middle)
+        )
+    P *= outside * (1.0 + 1e-9)
+    verdict = check(problem, K, H, P=P, gamma=2.0 * gains.certificate.gamma)
+    assert verdict.failure is not None
+    assert verdict.failure.startswith("(17)")
+    confirmed = back_off(problem, K, H, P)
+    assert confirmed.verdict.holds, confirmed.verdict.failure
+    assert confirmed.t > 0.0
+    assert confirmed.verdict.gamma < least_gamma(model.M, P) * (1.0 + 1e-4)
+
+
+@every_network
+def test_a_backed_off_P_has_t_to_spare(network: str) -> None:
+    """(1 - t)(P + tau P0) has at least about t I more than (1 - t) P in w, wherever noise acts."""
+    model = model_of(ALL[network, "lyapunov"])
+    P = np.tile(np.eye(model.size), (model.modes, 1, 1))
+    P0 = coupled_lyapunov(model, P)
+    assert P0 is not None
+    for t in (1e-3, 1e-1):
+        gained = inequality_17(model, relaxed(model, P, P0, t)) - (1.0 - t) * inequality_17(model, P)
+        assert np.linalg.eigvalsh(gained).min() > 0.0
 
 
 def test_unstable_gains_are_never_confirmed() -> None:
@@ -181,24 +523,38 @@ def test_unstable_gains_are_never_confirmed() -> None:
     model = error_model(problem, K_bar, H_bar)
     P = np.tile(np.eye(len(model.A[0])), (2, 1, 1))
     assert coupled_lyapunov(model, P) is None
-    confirmed = back_off(problem, K_bar, H_bar, P)
+    confirmed = back_off(problem, *link_gains(problem, K_bar, H_bar), P)
     assert not confirmed.verdict.holds
     assert confirmed.verdict.failure is not None
 
 
-def test_what_is_singular_in_exact_arithmetic_is_not_confirmed() -> None:
-    """P = M'M / gamma^2 on one state meets (18) with equality: refused; with 1e-12 to spare: accepted."""
-    problem = find("two-nodes")
-    zero, P = np.zeros((1, 2, 2)), np.diag([1.0, 0.25, 0.25])[None]
-    for gamma, holds in ((2.0, False), (2.0 * (1.0 + 1e-12), True)):
-        margin = check(problem, zero, zero, P=P, gamma=gamma).margins["(18) mode linked"]
-        assert (margin > 0.0) is holds
+# the command
+def test_the_command_says_what_is_proved_and_in_which_arithmetic(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both kinds; with --json the keys that other tools rely on."""
+    for kind, proved in (("lyapunov", "(17) and (18) of Theorem 1"), ("exact", "the recursion of the exact gain")):
+        path = tmp_path / f"{kind}.json"
+        ALL["paper", kind].save(path)  # type: ignore[index]
+        assert main(["verify", str(path)]) == EXIT_GOOD
+        out = capsys.readouterr().out
+        for part in ("holds: gamma = ", "mean-square stability", proved, "ball arithmetic of 128 bits", " s\n"):
+            assert part in out
+    false = tmp_path / "false.json"
+    mutated(ALL["paper", "exact"], lower_gamma).save(false)
+    assert main(["verify", str(false), "--json"]) == EXIT_NO
+    said = json.loads(capsys.readouterr().out)
+    assert said["holds"] is False
+    assert {"gamma", "arithmetic", "failure"} <= set(said)
+    assert main(["verify", str(false)]) == EXIT_NO
+    assert "does not hold: " in capsys.readouterr().out
 
 
-def test_verifying_imports_no_solver(gains: Gains, tmp_path: Path) -> None:
-    """The check runs in a process that never loads cvxpy, a conic solver or scipy."""
+@every_kind
+def test_verifying_imports_no_solver(kind: Kind, tmp_path: Path) -> None:
+    """The proof runs in a process that never loads cvxpy, a conic solver or scipy."""
     path = tmp_path / "gains.json"
-    gains.save(path)
+    ALL["paper", kind].save(path)
     code = (
         "import sys; from pathlib import Path; from agent.contract.gains import Gains;"
         "from designer.certificate import verify; assert verify(Gains.load(Path(sys.argv[1]))).holds;"

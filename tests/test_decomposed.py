@@ -16,8 +16,9 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains, Solver
 from agent.contract.problem import Problem
 from benchmarks.design import banded
-from designer.certificate import check, least_gamma, verify
-from designer.error_model import error_model
+from designer.back_off import least_gamma
+from designer.certificate import check, verify
+from designer.error_model import error_model, link_gains
 from designer.inwards import inwards
 from designer.lmi import cliques, conic, decomposed, theorem2
 from designer.lmi.cones import Assembly
@@ -305,7 +306,7 @@ def test_the_idle_network_is_strictly_inside(problem: Problem) -> None:
     np.testing.assert_allclose(K_bar[0], np.kron(np.eye(problem.n), problem.plant.A), atol=1e-12)
     P = block_diagonal(idle.R, idle.Q)
     gamma = 1.01 * least_gamma(error_model(problem, K_bar, H_bar).M, P)
-    verdict = check(problem, K_bar, H_bar, P=P, gamma=gamma)
+    verdict = check(problem, *link_gains(problem, K_bar, H_bar), P=P, gamma=gamma)
     assert verdict.holds
     assert min(verdict.margins.values()) > 1e-3
 
