@@ -22,13 +22,24 @@ def blocks(language: str) -> list[str]:
 
 def test_its_problem_is_a_problem() -> None:
     """The example of a problem file loads, and the example of a refusal is what it says."""
-    (text,) = blocks("toml")
+    text, _ = blocks("toml")
     document = tomllib.loads(text)
     assert Problem.from_document(document).node_names == ("inflow", "level")
     document["node"][0]["C"] = [[1.0]]
     with pytest.raises(InputError) as caught:
         Problem.from_document(document)
     assert f"peakmesh: tank.toml: {caught.value}\n" in README
+
+
+def test_its_example_of_a_real_network_is_one() -> None:
+    """What it adds to the problem is read, and lets the plant be unstable."""
+    text, added = map(tomllib.loads, blocks("toml"))
+    document = text | {"unbiased": added["unbiased"], "link": added["link"]}
+    document["node"][0] |= added["node"][0]
+    problem = Problem.from_document(document)
+    assert (problem.carries_plant, problem.delivery.tolist()) == (False, [[1.0, 1.0], [0.95, 1.0]])
+    document["plant"]["A"][0][0] = 1.02
+    Problem.from_document(document)
 
 
 def test_its_sensor_is_the_script() -> None:

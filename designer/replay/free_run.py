@@ -19,7 +19,6 @@ class Realised(NamedTuple):
 
     A: Array  # (n_eta, n_eta)
     B: Array  # (n_eta, nw)
-    BB: Array  # (n_eta, n_eta): B B'
     H: Array  # (n nx, sum ny): by which an input to the innovations acts; without what was not delivered
 
 
@@ -60,8 +59,7 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
     def transition(s: int, theta: bytes, phi: bytes) -> Realised:
         delivered = central.delivered(np.frombuffer(phi, dtype=bool))
         AB = realised(model, s, np.frombuffer(theta), delivered)
-        A_k, B_k = AB[:, :size], AB[:, size:]
-        return Realised(A_k, B_k, B_k @ B_k.T, _delivered_gains(central, s, delivered))
+        return Realised(AB[:, :size], AB[:, size:], _delivered_gains(central, s, delivered))
 
     x, eta, covariances, diagonal = np.zeros(len(plant.A)), np.zeros(size), np.zeros((2, size, size)), np.arange(size)
     for first in range(0, log.steps, block):
@@ -77,11 +75,11 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
         squares = _magnitudes(log, central, inputs, xs, etas, first) ** 2
         outputs = np.empty((len(steps), len(model.M), len(model.M)))
         for row in range(len(steps)):
-            A_k, _, BB_k, _ = transition(*keys[row])
+            A_k, B_k, _ = transition(*keys[row])
             outputs[row] = model.M @ covariances[0] @ model.M.T
             reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
             covariances = A_k @ covariances @ A_k.T
-            covariances[0] += BB_k
+            covariances[0] += B_k @ B_k.T
             covariances[1, diagonal, diagonal] += squares[row]
         yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), _largest(outputs))
 
