@@ -1,4 +1,4 @@
-"""What chance decides: modes, losses, disturbance, drawn from counter-based streams.
+"""What chance decides: modes, losses, deliveries, disturbance, drawn from counter-based streams.
 
 Every draw is a function of (seed, stream, step) alone: numpy's Philox generator with key (seed, stream) and a
 counter that starts at a multiple of the step. So a live run, a simulation and a replay see the same draws

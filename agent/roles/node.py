@@ -41,7 +41,7 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
                 _put(inbox, modes.next())
             while (sender := inbox.lacking) is not None:
                 _put(inbox, estimates[sender].next())
-            phi = deliveries.at(k)[i]
+            phi = deliveries.at(k)[i]  # a loss of the model: the message is there, and counts as if it were not
             mode, pairs = inbox.mode, inbox.heard(lost={sender for sender, j in senders.items() if not phi[j]})
             x_hat, heard = step(own, mode, pairs), list(pairs)
             inbox.next_step()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from pydantic import ValidationError
 
 from agent.bus import Bus
 from agent.contract.arrays import Array
@@ -46,6 +47,13 @@ class SimulatedPlant:
         """The messages of step `step`; the steps must be asked for one after the other, or RunBroken is raised."""
         if step != self._step:
             raise RunBroken(f"the mode of step {step} came where that of step {self._step} was due")
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self._advance(step)
+        except ValidationError:  # a message refuses NaN and infinity
+            raise RunBroken(f"the state of the plant is not finite at step {step}; its A lets it grow") from None
+
+    def _advance(self, step: int) -> tuple[PlantState, dict[str, Measurement]]:
         plant, x = self._problem.plant, self._x
         w, theta = self._disturbance.at(step), self._losses.at(step)
         state = PlantState(

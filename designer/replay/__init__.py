@@ -131,7 +131,8 @@ class PathAudit:
 
     def add(self, path: free_run.Path, tolerance: float) -> None:
         known = ~np.isnan(path.error) & ~np.isnan(path.bound)
-        within = path.error <= path.bound + tolerance * path.rounding
+        allowed = path.bound + tolerance * path.rounding
+        within = path.error <= allowed
         self.compared += int(known.sum())
         self.holds &= bool(within[known].all())
         steps = path.first + np.arange(len(path.error))
@@ -140,7 +141,7 @@ class PathAudit:
         self.is_equality_at_1 |= bool(trivial.any())
         counts &= ~trivial
         if counts.any():
-            margins = 1.0 - path.error[counts] / path.bound[counts]
+            margins = 1.0 - path.error[counts] / allowed[counts]  # the rounding of a state that grows may be all of it
             if margins.min() < self.margin:
                 self.margin, self.step = float(margins.min()), int(steps[counts][margins.argmin()])
 

@@ -102,7 +102,7 @@ class Verdict:
     peak: Peak | None  # against the simulated plant, also where sensors measured something else
     energy: float | None  # sum of |w|^2
     gamma: Gamma
-    path_margin: float | None  # smallest 1 - |z_tilde(k)| / (gamma_path(k) sqrt(energy before k)) that is not trivial
+    path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound that is not trivial; bound: proof 5 and its rounding
 
     @property
     def agrees(self) -> bool:
