@@ -157,8 +157,8 @@ def test_an_edited_gain_is_not_proved_by_the_certificate_that_it_kept(tmp_path: 
     verdict = golden_run(tmp_path, Gains.model_validate(document))
     assert (verdict.agrees, verdict.exit_code) == (True, 0)
     assert verdict.document()["certificate"] is False
-    assert verdict.document()["certificate_failure"].startswith('inequality (17) fails in mode "1"')
-    assert 'certificate  FAILS: inequality (17) fails in mode "1"' in verdict.text()
+    assert verdict.document()["certificate_failure"].startswith('(17) fails in mode "1"')
+    assert 'certificate  FAILS: (17) fails in mode "1"' in verdict.text()
     assert "gamma is not proved for these gains" in verdict.text()
     assert "gamma bounds" not in verdict.text()
 
