@@ -12,7 +12,7 @@ from importlib.metadata import version
 
 import agent.cli
 from agent.contract.errors import EXIT_INPUT
-from designer.commands import analyse, design, recordings, runs, show, verify
+from designer.commands import analyse, design, recordings, reproduce, runs, show, verify
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs.add_run(commands)
     recordings.add_replay(commands)
     recordings.add_report(commands)
+    reproduce.add_reproduce(commands)
     show.add_show(commands)
     agent.cli.add_roles(commands)
     options = parser.parse_args(arguments)

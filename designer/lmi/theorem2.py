@@ -85,6 +85,29 @@ def solve(problem: Problem, *, reduced: bool = False) -> LmiSolution:
     )
 
 
+class Said(NamedTuple):
+    """What one solver says of (42); gamma is None where it has no answer."""
+
+    gamma: float | None
+    status: str
+    iterations: int
+    seconds: float
+
+
+def said_by(solver: str, problem: Problem, *, iterations: int) -> Said:
+    """(36)(37) as printed, on rescaled data, by one solver that may stop after so many iterations; for comparison."""
+    if solver not in cp.installed_solvers():
+        return Said(None, "not installed", 0, 0.0)
+    units = natural_units(problem)
+    lmi = theorem2(rescaled(problem, units))
+    limit = {"max_iters": iterations} if solver == cp.SCS else {"max_iter": iterations}
+    status, seconds = _run(lmi.problem, solver, limit)
+    if status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        return Said(None, status, 0, seconds)
+    gamma = units.output * math.sqrt(max(float(lmi.delta.value), 0.0))
+    return Said(gamma, status, int(lmi.problem.solver_stats.num_iters or 0), seconds)
+
+
 def theorem2(problem: Problem, *, reduced: bool = False) -> Lmi:
     """The unknowns R, Q_i(s), X^s, Y^s and delta, and (42) subject to (36) and (37).
 
@@ -193,13 +216,13 @@ def _sparse(problem: Problem, s: int, widths: Sequence[int]) -> Any:
     return cp.bmat(rows)
 
 
-def _run(problem: cp.Problem, solver: str) -> tuple[str, float]:
+def _run(problem: cp.Problem, solver: str, options: dict[str, Any] | None = None) -> tuple[str, float]:
     """Solve; the status, or the solver's own words where it raised, and the seconds it took."""
     start = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what cvxpy warns of is the status, and the status is returned
         try:
-            problem.solve(solver=solver, **_OPTIONS[solver])
+            problem.solve(solver=solver, **(_OPTIONS[solver] | (options or {})))
             status = str(problem.status)
         except (cp.SolverError, ValueError, ArithmeticError) as error:
             status = f"failed: {str(error).splitlines()[0]}"

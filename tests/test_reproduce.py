@@ -1,0 +1,62 @@
+"""The paper's table: relations that its computed values keep, whatever they are."""
+
+from __future__ import annotations
+
+import pytest
+
+from designer.reproduce import EXAMPLES, PRINTED, ROWS, Reproduced, reproduce
+
+KEYS = [row.key for row in ROWS]
+
+
+@pytest.fixture(scope="module")
+def paper() -> Reproduced:
+    """Both examples, without the rows that take long."""
+    return reproduce(rows=["printed", "clarabel", "decomposed", "certified", "theorem2_exact", "floor"])
+
+
+def value(table: Reproduced, name: str, key: str) -> float:
+    found = table.values[name][key]
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_ladder_holds(paper: Reproduced, name: str) -> None:
+    """Floor <= exact gain of Theorem 2's gains <= their certified gamma, which is the optimum of the LMI."""
+    floor, exact, certified = (value(paper, name, key) for key in ("floor", "theorem2_exact", "certified"))
+    assert floor <= exact <= certified
+    assert certified == pytest.approx(value(paper, name, "clarabel"), rel=1e-4)
+    assert value(paper, name, "decomposed") == pytest.approx(value(paper, name, "clarabel"), rel=1e-4)
+
+
+def test_what_is_said_of_the_printed_values(paper: Reproduced) -> None:
+    """One lies below the optimum and one above; the distances are those of the table."""
+    first, second = paper.remarks()
+    below, above = (PRINTED[name] / value(paper, name, "clarabel") - 1.0 for name in EXAMPLES)
+    assert below < 0.0 < above
+    assert f"{-100.0 * below:.1f} % below the optimum" in first
+    assert "cannot come from (42)" in first
+    assert f"{100.0 * above:.1f} % above the optimum" in second
+
+
+def test_every_row() -> None:
+    """On a problem of which nothing is printed: two solvers agree, and the design for the exact gain is the lowest."""
+    said: list[str] = []
+    table = reproduce(["two-nodes"], report=said.append)
+    assert list(table.values["two-nodes"]) == KEYS
+    assert len(said) == len(KEYS)
+    assert table.values["two-nodes"]["printed"] is None
+    assert value(table, "two-nodes", "scs") == pytest.approx(value(table, "two-nodes", "clarabel"), rel=5e-3)
+    least = value(table, "two-nodes", "exact")
+    assert value(table, "two-nodes", "floor") <= least <= value(table, "two-nodes", "consensus") * (1.0 + 1e-3)
+    assert table.remarks() == []
+    assert f"{least:.6f}" in table.text()
+
+
+def test_a_solver_that_is_not_there_is_said() -> None:
+    values = dict.fromkeys(KEYS, 1.0) | {"scs": None, "consensus": None}
+    text = Reproduced({"zhu2020-ideal": values}).text()
+    assert "no answer" in text
+    assert "not stable" in text
+    assert "two solvers" not in text
