@@ -20,6 +20,8 @@ from designer.error_model import ErrorModel, error_model, measurement_slices, ro
 from designer.gain import Operator
 from designer.sensitivity import Inputs, slope, sweep
 
+_RIDGE = math.sqrt(10.0)
+
 StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny)
 
 
@@ -97,15 +99,16 @@ class Barrier:
         return J
 
     def centre(self, y: float, scale: float) -> bfgs.Function:
-        """The same with g held, and the size of the gains in place of y: -sum of log det + |v|^2 / scale^2.
+        """The same with g held, and the size of the gains in place of y: -sum of log det + 10 |v|^2 / scale^2.
 
-        The sum is least where the responses of all horizons together are small: for gains that decay fast.
+        The sum is least where the responses of all horizons together are small: for gains that decay fast. Without
+        the 10, gains of a flat minimum shrink so slowly that the search ends first (docs/theory.md has figures).
         """
 
         def J(v: Array) -> tuple[float, Array]:
             log_det, gradient = self._log_det(np.append(v, y))
-            ridge = v / scale
-            return float(ridge @ ridge) - log_det, 2.0 * ridge / scale - gradient[:-1]
+            ridge = _RIDGE * v / scale
+            return float(ridge @ ridge) - log_det, 2.0 * _RIDGE * ridge / scale - gradient[:-1]
 
         return J
 

@@ -1,7 +1,13 @@
-"""Kalman-consensus gains: a start for the descent that needs no solver, for any size of network.
+"""Gains to start the descent from, made without a solver, for any size of network.
 
-In every mode node i predicts as if its neighbourhood never changed: the Riccati equation of the sensors that it
-hears, with the losses taken as more noise; and it draws its estimate towards those of its neighbours.
+Kalman-consensus gains: in every mode node i predicts as if its neighbourhood never changed, by the Riccati equation
+of the sensors that it hears, with lost measurements and messages taken as more noise; and it draws its estimate
+towards those of its neighbours. For losses that are seen this Riccati equation is the one of intermittent
+observations (Sinopoli et al., IEEE Transactions on Automatic Control 49(9), 2004), for a gain that is constant.
+
+Gains of least variance: the same thought, but for the network as it is. The covariance of all errors under white w is
+carried forward, and in every step each node takes the gains that leave the least mean square of its next error.
+Where that covariance settles, the error system is mean-square stable, so these are a start for unstable plants too.
 """
 
 from __future__ import annotations
@@ -10,17 +16,26 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.error_model import measurement_slices, rows_total
+from designer.error_model import ErrorModel, error_model, measurement_slices, rows_total
+from designer.gain import Operator
 
 _MOST_STEPS = 1000
+_STEPS_OF_NETWORK = 300
+_SETTLED_NETWORK = 1e-6
+_RESTARTS = 0.01  # so that a mode that the chain leaves for ever has gains of its own too
+_STIRRED = 1e-4  # white noise on every error, beside w: so that no direction goes unseen
+_BOUNDLESS = 1e100
 
 
 def consensus_gains(problem: Problem, *, weight: float) -> tuple[Array, Array]:
-    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny); the neighbours' estimates share `weight`."""
+    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny); the neighbours' estimates share `weight`.
+
+    The blocks of each row of K_bar, a_ij K_ij, sum to A: the gains are unbiased.
+    """
     nx, A, columns = problem.nx, problem.plant.A, measurement_slices(problem)
     K_bar = np.zeros((len(problem.topologies), problem.n * nx, problem.n * nx))
     H_bar = np.zeros((len(problem.topologies), problem.n * nx, rows_total(problem)))
-    spread = _plant_covariance(problem)
+    spread = _plant_covariance(problem) if problem.carries_plant else np.zeros((nx, nx))
     for s in range(len(problem.topologies)):
         for i in range(problem.n):
             heard, rows = problem.neighbours(s, i), slice(i * nx, (i + 1) * nx)
@@ -29,26 +44,35 @@ def consensus_gains(problem: Problem, *, weight: float) -> tuple[Array, Array]:
                 share = 1.0 if not others else 1.0 - weight if j == i else weight / others
                 K_bar[s, rows, j * nx : (j + 1) * nx] = share * A
             at = np.concatenate([np.arange(columns[j].start, columns[j].stop) for j in heard])
-            H_bar[s][rows, at] = _predictor_gain(problem, heard, spread)
+            H_bar[s][rows, at] = _predictor_gain(problem, i, heard, spread)
     return K_bar, H_bar
 
 
-def _predictor_gain(problem: Problem, heard: tuple[int, ...], spread: Array) -> Array:
-    """L = (A P C' + B D')(C P C' + D D' + losses)^-1 of the nodes `heard`, (nx, their measurements), C with beta."""
-    A, B, nodes, beta = problem.plant.A, problem.plant.B, problem.nodes, problem.beta
-    C = np.vstack([beta[j] * nodes[j].C for j in heard])
-    D = np.vstack([nodes[j].D for j in heard])
-    noise, first = D @ D.T, 0
-    for j in heard:
-        rows = slice(first, first + len(nodes[j].C))
-        noise[rows, rows] += beta[j] * (1.0 - beta[j]) * (nodes[j].C @ spread @ nodes[j].C.T)
-        first = rows.stop
-    P = B @ B.T
+def _predictor_gain(problem: Problem, i: int, heard: tuple[int, ...], spread: Array) -> Array:
+    """L = (A P C' + B D')(C P C' + D D' + losses)^-1 of the nodes `heard` by node i, (nx, their measurements).
+
+    C and D stand for the means of what arrives, so with rho beta. What theta and phi do beside that is noise.
+    """
+    A, B, nodes = problem.plant.A, problem.plant.B, [problem.nodes[j] for j in heard]
+    rho, beta = problem.delivery[i, list(heard)], problem.beta[list(heard)]
+    mean_D = [b if node.seen else 1.0 for b, node in zip(beta, nodes, strict=True)]
+    C = np.vstack([b * node.C for b, node in zip(beta, nodes, strict=True)])  # of the messages
+    D = np.vstack([b * node.D for b, node in zip(mean_D, nodes, strict=True)])
+    sizes = [len(node.C) for node in nodes]
+    arrives, owner = np.repeat(rho, sizes), np.repeat(np.arange(len(nodes)), sizes)
+    together = owner[:, None] == owner
+    P, BB = B @ B.T, B @ B.T
     for _ in range(_MOST_STEPS):
-        innovation, cross = C @ P @ C.T + noise, A @ P @ C.T + B @ D.T
+        mean = C @ P @ C.T + D @ D.T
+        innovation = arrives[:, None] * arrives * mean + (arrives * (1.0 - arrives)) * together * mean
+        for j, node in enumerate(nodes):
+            lost = node.C @ P @ node.C.T + node.D @ node.D.T if node.seen else node.C @ spread @ node.C.T
+            rows = np.ix_(owner == j, owner == j)
+            innovation[rows] += rho[j] * beta[j] * (1.0 - beta[j]) * lost
+        cross = (A @ P @ C.T + B @ D.T) * arrives
         L = cross @ np.linalg.pinv(innovation, rcond=1e-10, hermitian=True)
-        P_next = A @ P @ A.T + B @ B.T - L @ cross.T
-        if np.abs(P_next - P).max() <= 1e-10 * np.abs(P).max():
+        P_next = A @ P @ A.T + BB - L @ cross.T
+        if np.abs(P_next - P).max() <= 1e-10 * np.abs(P).max() or np.abs(P_next).max() > _BOUNDLESS:
             break
         P = (P_next + P_next.T) / 2.0
     return np.asarray(L)
@@ -61,3 +85,88 @@ def _plant_covariance(problem: Problem) -> Array:
         X = X + power @ X @ power.T
         power = power @ power
     return np.asarray(X)
+
+
+def least_variance_gains(problem: Problem) -> tuple[Array, Array]:
+    """K_bar and H_bar at which white w leaves each node the least mean square of e_i, given the others' gains."""
+    modes = len(problem.topologies)
+    chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
+    chain /= chain.sum(axis=1, keepdims=True)
+    occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
+    K_bar = np.zeros((modes, problem.n * problem.nx, problem.n * problem.nx))
+    H_bar = np.zeros((modes, problem.n * problem.nx, rows_total(problem)))
+    size = problem.nx * (problem.n + (1 if problem.carries_plant else 0))
+    fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
+    X = fresh
+    joint = np.zeros((modes, size + problem.nw, size + problem.nw))
+    joint[:, size:, size:] = occupied[:, None, None] * np.eye(problem.nw)
+    for _ in range(_STEPS_OF_NETWORK):
+        joint[:, :size, :size] = X
+        for s in range(modes):
+            for i in range(problem.n):
+                _least_square(problem, s, i, joint[s], K_bar, H_bar)
+        operator = Operator(error_model(problem, K_bar, H_bar))
+        operator.transition = chain
+        X_next = operator.carry(joint) + fresh
+        change = np.abs(X_next - X).max()
+        X = (X_next + X_next.swapaxes(1, 2)) / 2.0
+        if change <= _SETTLED_NETWORK * np.abs(X).max() or np.abs(X).max() > _BOUNDLESS:
+            break
+    return K_bar, H_bar
+
+
+def _least_square(problem: Problem, s: int, i: int, joint: Array, K_bar: Array, H_bar: Array) -> None:
+    """Set the rows of node i in mode s, in place, to those with the least E|e_i(k+1)|^2; joint is that of [eta; w].
+
+    e_i(k+1) = t - sum_j K_ij a_j - sum_j H_ij phi_ij nu_j, and the best [K H] is E[t r'] E[r r']^-1, r all a_j and
+    phi_ij nu_j. Where gains are unbiased t = A e_i + B w and a_j = phi_ij (e_i - e_j), j != i; elsewhere
+    t = A x + B w and a_j = phi_ij x_hat_j + (1 - phi_ij) x_hat_i.
+    """
+    nx, plant, p = problem.nx, problem.plant, problem.nx if problem.carries_plant else 0
+    heard, columns = problem.neighbours(s, i), measurement_slices(problem)
+    others = [j for j in heard if not problem.unbiased or j != i]
+    size, eye = len(joint) - problem.nw, np.eye(nx)
+
+    def e(j: int) -> slice:
+        return slice(p + j * nx, p + (j + 1) * nx)
+
+    t = np.zeros((nx, len(joint)))
+    t[:, e(i) if problem.unbiased else slice(p)] = plant.A
+    t[:, size:] = plant.B
+    K_part = {j: slice(k * nx, (k + 1) * nx) for k, j in enumerate(others)}
+    ends = len(others) * nx + np.cumsum([0, *(len(problem.nodes[j].C) for j in heard)])
+    H_part = {j: slice(int(ends[k]), int(ends[k + 1])) for k, j in enumerate(heard)}
+    r = np.zeros((int(ends[-1]), len(joint)))  # the mean of the regressors
+    noises = []
+    for j in heard:
+        node, beta, rho = problem.nodes[j], problem.beta[j], problem.delivery[i, j]
+        phi = np.zeros_like(r)  # what phi_ij multiplies
+        if j in K_part:
+            if not problem.unbiased:
+                r[K_part[j], :p] = eye
+                r[K_part[j], e(i)] = -eye
+            phi[K_part[j], e(i)] += eye
+            phi[K_part[j], e(j)] -= eye
+        phi[H_part[j], e(j)] = beta * node.C
+        phi[H_part[j], size:] = (beta if node.seen else 1.0) * node.D
+        r += rho * phi
+        if rho < 1.0:
+            noises.append(np.sqrt(rho * (1.0 - rho)) * phi)
+        if beta < 1.0:
+            lost = np.zeros_like(r)
+            if node.seen:
+                lost[H_part[j], e(j)], lost[H_part[j], size:] = node.C, node.D
+            else:
+                lost[H_part[j], :p] = node.C
+            noises.append(np.sqrt(rho * beta * (1.0 - beta)) * lost)
+    gram = r @ joint @ r.T + sum((noise @ joint @ noise.T for noise in noises), np.zeros((len(r), len(r))))
+    scale = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
+    inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True)
+    best = (t @ joint @ r.T * scale) @ inverse * scale
+    rows = slice(i * nx, (i + 1) * nx)
+    if problem.unbiased:
+        K_bar[s, rows, rows] = plant.A - sum((best[:, K_part[j]] for j in others), np.zeros((nx, nx)))
+    for j in others:
+        K_bar[s, rows, j * nx : (j + 1) * nx] = best[:, K_part[j]]
+    for j in heard:
+        H_bar[s, rows, columns[j]] = best[:, H_part[j]]

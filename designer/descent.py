@@ -56,6 +56,11 @@ class Candidate(NamedTuple):
         """Size times the steps that E|eta|^2 takes to decay: what is kept low among gains that guarantee the same."""
         return self.norm / (1.0 - self.gain.radius) if self.gain.radius < 1.0 else math.inf
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The least gain comes first; of gains that are not mean-square stable, what grows least."""
+        return self.gain.high, self.gain.low if self.gain.stable else self.gain.radius
+
 
 class Descent(NamedTuple):
     """What the search found: `chosen` is at most 0.1 % above `least`, and smaller or faster to decay."""
@@ -84,9 +89,9 @@ def descend(
     except KeyboardInterrupt:
         interrupted = True
     found = [_candidate(problem, *gains) for gains in (*starts.values(), *search.in_hand())]
-    least = min(found, key=lambda candidate: (candidate.gain.high, candidate.gain.low))
+    least = min(found, key=lambda candidate: candidate.rank)
     near = [candidate for candidate in found if candidate.gain.high <= _SLACK * (1.0 + 1e-6) * least.gain.high]
-    chosen = min(near, key=lambda candidate: candidate.cost)
+    chosen = min(near, key=lambda candidate: candidate.cost) if least.gain.stable else least
     return Descent(chosen, least, search.found, search.steps, interrupted)
 
 

@@ -5,6 +5,7 @@ The ladder: floor <= exact gain <= certified gamma <= Theorem 2's gamma, where t
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 
@@ -16,15 +17,16 @@ from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.barrier import StackedGains
 from designer.certificate import Verdict
-from designer.consensus import consensus_gains
+from designer.consensus import consensus_gains, least_variance_gains
 from designer.descent import Descent, Progress, descend
 from designer.error_model import error_model, link_gains, stacked_links
 from designer.exact_certificate import check_exact
 from designer.floor import floor
 from designer.gain import Gain, exact_gain
 
-_CONSENSUS_WEIGHTS = (0.2, 0.4)
-_LMI_STATES = 8  # n nx up to which Theorem 2, a second or two there, gives one more start
+_CONSENSUS_WEIGHT = 0.4
+_LMI_STARTS = ("theorem2", "decomposed")
+_LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -40,12 +42,22 @@ def design_exact(
     KeyboardInterrupt ends the search; the best so far is returned.
     """
     started = time.perf_counter()
+    if math.isinf(floor(problem)):
+        raise Unattainable(
+            f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
+            "the plant that the disturbance drives; measure it"
+        )
     starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
-    lmi_exact = exact_bounds(problem, *starts["theorem2"]) if "theorem2" in starts else None
+    lmi_exact = next((exact_bounds(problem, *starts[name]) for name in _LMI_STARTS if name in starts), None)
     begun = time.perf_counter()
     descent = descend(problem, starts, progress=progress)
     solved = time.perf_counter()
     chosen = descent.chosen
+    if not chosen.gain.stable:
+        raise Unattainable(
+            f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
+            f"{chosen.gain.radius:.6g} in each step, and less than 1 is needed; {_advice(problem)}"
+        )
     K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
     certificate = certify(problem, K, H)
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
@@ -88,20 +100,24 @@ def exact_bounds(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[float, f
 
 
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
-    """Gains to start from, and gamma of Theorem 2 where that is one of them."""
-    starts = {f"consensus {weight}": consensus_gains(problem, weight=weight) for weight in _CONSENSUS_WEIGHTS}
+    """Gains to start from, and gamma of the LMI where that gave one of them."""
+    starts = {
+        "least variance": least_variance_gains(problem),
+        f"consensus {_CONSENSUS_WEIGHT}": consensus_gains(problem, weight=_CONSENSUS_WEIGHT),
+    }
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None
     from designer.lmi import beyond_paper, decomposed, theorem2  # cvxpy takes seconds to import
     from designer.synthesis import recover
 
+    name = "decomposed" if beyond_paper(problem) else "theorem2"
     try:
         solution = decomposed.solve(problem) if beyond_paper(problem) else theorem2.solve(problem, reduced=True)
         gains = recover(problem, solution)
     except Unattainable:
         return starts, None  # one start less
     if np.isfinite(gains[0]).all() and np.isfinite(gains[1]).all():
-        starts["theorem2"] = gains
+        starts[name] = gains
     return starts, solution.gamma
 
 
@@ -111,7 +127,7 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
     if gain.P is None:
         raise Unattainable(
             f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
-            "in each step; peakmesh design PROBLEM --method theorem2 gives stable ones"
+            "in each step, and less than 1 is needed"
         )
     verdict = _confirmed(problem, K, H, gain, gain.P)
     if not verdict.holds:
@@ -130,6 +146,16 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
         holds=verdict.holds,
         verified=f"(17) for P, the recursion of the exact gain over the horizon and its tail: {verdict.arithmetic}",
         margins=verdict.margins,
+    )
+
+
+def _advice(problem: Problem) -> str:
+    radius = float(np.abs(np.linalg.eigvals(problem.plant.A)).max())
+    if radius < 1.0:
+        return "try --method decomposed"
+    return (
+        f"A itself has spectral radius {radius:.6g}: let more measurements and messages arrive, or let every node "
+        "hear what shows the unstable part"
     )
 
 

@@ -84,6 +84,18 @@ class Operator:
         """L(Y) = A'Y_bar A + sum of alpha_i F_i'Y_bar F_i, the mean of Y one step later, (modes, n_eta, n_eta)."""
         return self.joint(self.bar(Y))[:, : self.size, : self.size]
 
+    def carry(self, joint: Array) -> Array:
+        """E[eta(k+1) eta(k+1)'; r(k+1)] by mode, (modes, n_eta, n_eta), from `joint`, that of [eta; w] at k.
+
+        The adjoint of L: `joint` has E[[eta; w][eta; w]'; r(k) = s] for every s, (modes, n_eta + nw, n_eta + nw).
+        """
+        X = self.AB @ joint @ self.AB_T
+        if len(self.lossy):
+            X[:, self.p :, self.p :] += self.H @ ((self.R @ joint @ self.R_T) * self.same) @ self.H_T
+        if self.links is not None:
+            self.links.carry(X, joint)
+        return np.asarray((self.transition.T @ X.reshape(len(X), -1)).reshape(X.shape))
+
 
 class _Links:
     """What lossy links add to `Operator.joint`: V_l'Y_bar V_l for every term, at its columns."""

@@ -111,13 +111,7 @@ def slope(model: ErrorModel, operator: Operator, inputs: Inputs, swept: Sweep, V
         spent += float(np.trace(GXG, axis1=1, axis2=2).sum())
         joint[k, :, :size, :size], joint[k, :, size:, :size] = X, GX
         joint[k, :, :size, size:], joint[k, :, size:, size:] = GX.swapaxes(1, 2), GXG + V[k]
-        X_next = operator.AB @ joint[k] @ operator.AB_T
-        if len(operator.lossy):
-            lost = (operator.R @ joint[k] @ operator.R_T) * operator.same
-            X_next[:, p:, p:] += operator.H @ lost @ operator.H_T
-        if links is not None:
-            links.carry(X_next, joint[k])
-        X = (operator.transition.T @ X_next.reshape(modes, -1)).reshape(X.shape)
+        X = operator.carry(joint[k])
     by_AB = 2.0 * (swept.Y_bar[:, :, p:] @ (operator.AB @ joint)).sum(axis=0)  # (modes, n nx, n_eta + nw)
     by_H = np.zeros_like(model.H)
     if len(operator.lossy):

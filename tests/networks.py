@@ -11,12 +11,27 @@ from agent.contract.problem import Problem
 
 
 def random_problem(
-    seed: int, *, n: int = 3, nx: int = 2, nw: int = 2, nz: int = 1, modes: int = 2, lossy: bool = True
+    seed: int,
+    *,
+    n: int = 3,
+    nx: int = 2,
+    nw: int = 2,
+    nz: int = 1,
+    modes: int = 2,
+    lossy: bool = True,
+    seen: str = "none",
+    links: bool = False,
+    unbiased: bool = False,
+    radius: float = 0.8,
 ) -> Problem:
-    """A stable plant, nodes with one or two measurements each, weights other than 1, node 1 without loss."""
+    """A plant with this spectral radius, nodes with one or two measurements each, weights other than 1.
+
+    Node 0 loses nothing. `seen` says which nodes know their losses: "none", "some" (every second) or "all"; with
+    `links` about half of all links lose messages.
+    """
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(nx, nx))
-    A *= 0.8 / np.abs(np.linalg.eigvals(A)).max()
+    A *= radius / np.abs(np.linalg.eigvals(A)).max()
     transition = rng.uniform(0.1, 1.0, size=(modes, modes))
     transition /= transition.sum(axis=1, keepdims=True)
     document: dict[str, Any] = {
@@ -38,6 +53,19 @@ def random_problem(
         "topology": [{"name": f"m{s}", "adjacency": _adjacency(rng, n).tolist()} for s in range(modes)],
         "markov": {"transition": transition.tolist(), "initial": "m0"},
     }
+    for i, node in enumerate(document["node"]):
+        if seen == "all" or (seen == "some" and i % 2):
+            node["loss"] = "seen"
+    if unbiased:
+        document["unbiased"] = True
+    if links:
+        adjacency = np.array([topology["adjacency"] for topology in document["topology"]])
+        heard = [(i, j) for i, j in np.argwhere(adjacency.max(axis=0) > 0.0) if i != j]
+        lossy_links = [pair for pair in heard if rng.uniform() < 0.5] or heard[:1]
+        document["link"] = [
+            {"receiver": f"n{i}", "sender": f"n{j}", "delivery_probability": float(rng.uniform(0.5, 0.95))}
+            for i, j in lossy_links
+        ]
     return Problem.from_document(document)
 
 
@@ -75,7 +103,7 @@ def real_network(
 
 
 def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Array, Array]:
-    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) with the sparsity of (9)."""
+    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) with the sparsity of (9); unbiased where asked."""
     rng = np.random.default_rng(seed)
     K_bar, H_bar = [], []
     for s in range(len(problem.topologies)):
@@ -86,6 +114,8 @@ def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Arr
             H_rows.append(
                 [_block(rng, problem.nx, len(node.C), j in heard, size) for j, node in enumerate(problem.nodes)]
             )
+            if problem.unbiased:
+                K_rows[i][i] = problem.plant.A - sum(K_rows[i][j] for j in heard if j != i)
         K_bar.append(np.block(K_rows))
         H_bar.append(np.block(H_rows))
     return np.array(K_bar), np.array(H_bar)
