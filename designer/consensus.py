@@ -16,7 +16,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.error_model import ErrorModel, error_model, measurement_slices, rows_total
+from designer.error_model import error_model, measurement_slices, rows_total
 from designer.gain import Operator
 
 _MOST_STEPS = 1000

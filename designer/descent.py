@@ -4,7 +4,9 @@ gamma_T is not smooth where several modes and directions are critical at once, a
 minimum is approached from inside, along the path of the minima of designer.barrier's J while mu falls; J is smooth,
 and BFGS follows it. docs/theory.md, "Design", has what else was tried.
 
-The last word is the exact gain of the gains found. If it shows that the horizon T was too short, T is doubled.
+The last word is the exact gain of the gains found. If it shows that the horizon T was too short, T is doubled. That
+is so for gains that are not mean-square stable too: gamma_T is finite for them, and the longer T is, the more it is
+what grows in the errors that is made small. Where that rate falls no further from T to 2 T, the search ends.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ _SLACK = 1.001  # gamma may be this factor above the least one found, for gains 
 _HORIZON = 30
 _LONGEST = 480
 _SHORT = 1e-4  # gamma may exceed gamma_T by so much of itself before T is doubled
+_SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
 _MOST_STEPS = 1000
 
@@ -126,10 +129,17 @@ class _Search:
             self.found[name] = math.exp(coarse[name].x[-1] / 2.0)
         name = min(self.found, key=lambda start: self.found[start])
         point = self._follow(name, _FINE, coarse[name].x, coarse[name].inverse_hessian)
-        while self._horizon_is_short(point.x):
+        gain, radius = self._gain(point.x), math.inf
+        while self._horizon_is_short(gain, point.x) and (gain.stable or gain.radius < radius * _SLOWER):
+            radius = gain.radius
             self.barrier, self.best = Barrier(self.problem, 2 * self.barrier.horizon), None
             point = self._follow(name, _FINE, self._begin(self.barrier.entries.unpack(point.x[:-1])))
-        self._centre(point)
+            gain = self._gain(point.x)
+        if gain.stable:
+            self._centre(point)
+
+    def _gain(self, x: Array) -> Gain:
+        return exact_gain(error_model(self.problem, *self.barrier.entries.unpack(x[:-1])))
 
     def _begin(self, gains: StackedGains) -> Array:
         """[v; y] with g 10 % above gamma_T^2."""
@@ -154,8 +164,7 @@ class _Search:
             x, inverse_hessian = point.x, point.inverse_hessian
         return point
 
-    def _horizon_is_short(self, x: Array) -> bool:
-        gain = exact_gain(error_model(self.problem, *self.barrier.entries.unpack(x[:-1])))
+    def _horizon_is_short(self, gain: Gain, x: Array) -> bool:
         return 2 * self.barrier.horizon <= _LONGEST and gain.high > math.exp(x[-1] / 2.0) * (1.0 + _SHORT)
 
     def _centre(self, point: bfgs.Point) -> None:

@@ -58,7 +58,7 @@ def floor(problem: Problem) -> float:
 
 
 def _detectable(A: Array, C: Array) -> bool:
-    """Whether C shows every eigenvector of A whose eigenvalue is not inside the unit circle (Popov, Belevitch, Hautus)."""
+    """Whether C shows every eigenvector of A whose eigenvalue is not inside the unit circle."""
     scaled = C / np.maximum(np.linalg.norm(C, axis=1), np.finfo(float).tiny)[:, None]
     unstable = [root for root in np.linalg.eigvals(A) if abs(root) > 1.0 - _DEPENDENT]
     sizes = [np.linalg.svd(np.vstack([A - root * np.eye(len(A)), scaled]), compute_uv=False) for root in unstable]

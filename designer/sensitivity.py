@@ -160,8 +160,10 @@ def critical_sweep(operator: Operator, horizon: int) -> tuple[float, Sweep]:
         holds, _ = horizon_holds(operator, low * (1.0 - 1e-8), middle)
         first, last = (middle, last) if holds else (first, middle)
     _, g = horizon_gain(operator, last, width=1e-13)
-    swept = sweep(operator, g, last)
-    assert swept is not None  # the recursion held at g
+    swept, above = sweep(operator, g, last), 1e-14
+    while swept is None:  # the recursion held at g, but the sweep rounds in another order
+        above *= 2.0
+        swept = sweep(operator, g * (1.0 + above), last)
     return g, swept
 
 

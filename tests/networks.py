@@ -11,27 +11,12 @@ from agent.contract.problem import Problem
 
 
 def random_problem(
-    seed: int,
-    *,
-    n: int = 3,
-    nx: int = 2,
-    nw: int = 2,
-    nz: int = 1,
-    modes: int = 2,
-    lossy: bool = True,
-    seen: str = "none",
-    links: bool = False,
-    unbiased: bool = False,
-    radius: float = 0.8,
+    seed: int, *, n: int = 3, nx: int = 2, nw: int = 2, nz: int = 1, modes: int = 2, lossy: bool = True
 ) -> Problem:
-    """A plant with this spectral radius, nodes with one or two measurements each, weights other than 1.
-
-    Node 0 loses nothing. `seen` says which nodes know their losses: "none", "some" (every second) or "all"; with
-    `links` about half of all links lose messages.
-    """
+    """A stable plant, nodes with one or two measurements each, weights other than 1, node 1 without loss."""
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(nx, nx))
-    A *= radius / np.abs(np.linalg.eigvals(A)).max()
+    A *= 0.8 / np.abs(np.linalg.eigvals(A)).max()
     transition = rng.uniform(0.1, 1.0, size=(modes, modes))
     transition /= transition.sum(axis=1, keepdims=True)
     document: dict[str, Any] = {
@@ -53,19 +38,6 @@ def random_problem(
         "topology": [{"name": f"m{s}", "adjacency": _adjacency(rng, n).tolist()} for s in range(modes)],
         "markov": {"transition": transition.tolist(), "initial": "m0"},
     }
-    for i, node in enumerate(document["node"]):
-        if seen == "all" or (seen == "some" and i % 2):
-            node["loss"] = "seen"
-    if unbiased:
-        document["unbiased"] = True
-    if links:
-        adjacency = np.array([topology["adjacency"] for topology in document["topology"]])
-        heard = [(i, j) for i, j in np.argwhere(adjacency.max(axis=0) > 0.0) if i != j]
-        lossy_links = [pair for pair in heard if rng.uniform() < 0.5] or heard[:1]
-        document["link"] = [
-            {"receiver": f"n{i}", "sender": f"n{j}", "delivery_probability": float(rng.uniform(0.5, 0.95))}
-            for i, j in lossy_links
-        ]
     return Problem.from_document(document)
 
 
@@ -73,23 +45,23 @@ def real_network(
     problem: Problem,
     *,
     seen: bool | list[str] = False,
-    delivery: float | None = None,
+    delivery: float | Array | None = None,
     unbiased: bool = False,
     radius: float | None = None,
 ) -> Problem:
     """The problem with what is not in the paper.
 
-    `seen`: the nodes that see their losses, or all; `delivery`: of every link that some topology has; `radius`: the
-    spectral radius that A is scaled to.
+    `seen`: the nodes that see their losses, or all; `delivery`: of every link that some topology has, or (n, n) of
+    each; `radius`: the spectral radius that A is scaled to.
     """
     document = problem.document()
     for node in document["node"]:
         if seen is True or (seen and node["name"] in seen):
             node["loss"] = "seen"
     if delivery is not None:
-        names = problem.node_names
+        names, rho = problem.node_names, np.broadcast_to(delivery, (problem.n, problem.n))
         document["link"] = [
-            {"receiver": receiver, "sender": names[j], "delivery_probability": delivery}
+            {"receiver": receiver, "sender": names[j], "delivery_probability": float(rho[i, j])}
             for i, receiver in enumerate(names)
             for j in problem.ever_heard(i)
             if i != j
@@ -100,6 +72,25 @@ def real_network(
         A = problem.plant.A
         document["plant"]["A"] = (A * radius / np.abs(np.linalg.eigvals(A)).max()).tolist()
     return Problem.from_document(document)
+
+
+def real_networks(seed: int, **shape: Any) -> dict[str, Problem]:
+    """One random problem with each of what is not in the paper, and with combinations; two links lose messages."""
+    base = random_problem(seed, **shape)
+    pairs = [(i, j) for i in range(base.n) for j in base.ever_heard(i) if i != j]
+    rng = np.random.default_rng(seed)
+    rho = np.ones((base.n, base.n))
+    for at in rng.permutation(len(pairs))[:2]:
+        rho[pairs[at]] = rng.uniform(0.5, 0.9)
+    some = list(base.node_names[1::2])
+    return {
+        "seen": real_network(base, seen=True),
+        "links": real_network(base, delivery=rho),
+        "some seen, links": real_network(base, seen=some, delivery=rho),
+        "unbiased": real_network(base, unbiased=True),
+        "unbiased, some seen, links": real_network(base, seen=some, delivery=rho, unbiased=True),
+        "unbiased, seen, links, unstable": real_network(base, seen=True, delivery=rho, unbiased=True, radius=1.1),
+    }
 
 
 def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Array, Array]:

@@ -6,28 +6,33 @@ import math
 
 import numpy as np
 import pytest
-from networks import random_gains, random_problem
+from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
+from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains
+from agent.contract.problem import Problem
 from designer import bfgs
 from designer.barrier import Barrier, Entries
 from designer.certificate import verify
-from designer.consensus import consensus_gains
+from designer.consensus import consensus_gains, least_variance_gains
 from designer.descent import Progress, descend
-from designer.error_model import error_model
+from designer.error_model import error_model, link_gains, stacked_links
+from designer.exact_design import design_exact
 from designer.floor import floor
-from designer.gain import exact_gain
+from designer.gain import Operator, exact_gain
 from designer.problems import find
 from designer.synthesis import design
 
+PROBLEMS = [random_problem(1), random_problem(2), *real_networks(3).values()]
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_gradients_of_both_barriers_agree_with_differences(seed: int) -> None:
-    """By every direction of the gains and of y = log g."""
-    problem = random_problem(seed)
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
+def test_the_gradients_of_both_barriers_agree_with_differences(problem: Problem) -> None:
+    """By every direction of the gains that they may take, and of y = log g."""
     barrier = Barrier(problem, 9)
-    v = barrier.entries.pack(*random_gains(problem, seed, size=0.1))
+    gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
+    v = barrier.entries.pack(*gains)
     y = math.log(2.0 * exact_gain(error_model(problem, *barrier.entries.unpack(v))).high ** 2)
     rng = np.random.default_rng(0)
     for function, x in ((barrier.descent(0.03), np.append(v, y)), (barrier.centre(y, 2.0), v)):
@@ -68,6 +73,44 @@ def test_consensus_gains_leave_the_estimates_unbiased() -> None:
     np.testing.assert_allclose(K_bar @ ones, np.tile(problem.plant.A, (2, problem.n, 1)), atol=1e-14)
 
 
+@pytest.mark.parametrize("kind", sorted(real_networks(4)))
+def test_both_starts_keep_to_the_entries_and_are_unbiased_where_asked(kind: str) -> None:
+    """Nothing is lost by packing them, weights other than 1 included, and the file takes them."""
+    problem = real_networks(4)[kind]
+    entries, ones = Entries(problem), np.tile(np.eye(problem.nx), (problem.n, 1))
+    for K_bar, H_bar in (consensus_gains(problem, weight=0.3), least_variance_gains(problem)):
+        for stacked, back in zip((K_bar, H_bar), entries.unpack(entries.pack(K_bar, H_bar)), strict=True):
+            np.testing.assert_allclose(stacked, back, atol=1e-12)
+        if problem.unbiased:
+            np.testing.assert_allclose(K_bar @ ones, np.tile(problem.plant.A, (2, problem.n, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", sorted(real_networks(5)))
+def test_gains_of_least_variance_leave_each_node_no_better_choice(kind: str) -> None:
+    """E|e_i|^2 of every node under white w, where it has settled, rises with any change of that node's own gains."""
+    problem = real_networks(5)[kind]
+    K_bar, H_bar = least_variance_gains(problem)
+    entries, rng = Entries(problem), np.random.default_rng(0)
+    v = entries.pack(K_bar, H_bar)
+    operator, X = Operator(error_model(problem, K_bar, H_bar)), None
+    nx, p, w = problem.nx, operator.p, np.eye(problem.nw)
+    occupied = np.linalg.matrix_power(problem.markov.transition, 10_000)[0]
+    joint = np.zeros((2, operator.size + operator.nw, operator.size + operator.nw))
+    joint[:, operator.size :, operator.size :] = occupied[:, None, None] * w
+    for _ in range(400):
+        X = operator.carry(joint)
+        joint[:, : operator.size, : operator.size] = X
+
+    def variances(gains: tuple[Array, Array]) -> Array:
+        X = Operator(error_model(problem, *gains)).carry(joint).sum(axis=0)
+        return np.diag(X)[p:].reshape(problem.n, nx).sum(axis=1)
+
+    least = variances((K_bar, H_bar))
+    for _ in range(10):
+        other = variances(entries.unpack(v + 0.1 * rng.normal(size=len(v))))
+        assert (other > least * (1.0 - 1e-3)).all()
+
+
 def test_bfgs_finds_a_minimum_with_a_kink() -> None:
     """Nesterov's nonsmooth variant of Rosenbrock's function, minimum 0 at (1, 1)."""
 
@@ -94,6 +137,58 @@ def test_any_start_leads_to_the_answer_that_is_known() -> None:
     assert found.chosen.gain.high <= found.least.gain.high * 1.00101
     assert found.chosen.cost <= found.least.cost
     assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+
+
+@pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
+def test_starts_agree_with_what_real_networks_need(kind: str) -> None:
+    """From gains that share nothing but their sparsity, within 0.5 %; the result is above the floor and stable."""
+    problem = real_networks(6, n=2)[kind]
+    starts = {"consensus": consensus_gains(problem, weight=0.4), "least variance": least_variance_gains(problem)}
+    found = descend(problem, starts)
+    assert found.chosen.gain.stable
+    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+    before = min(exact_gain(error_model(problem, *gains)).high for gains in starts.values())
+    assert floor(problem) <= found.least.gain.high < before
+    K, H = link_gains(problem, found.chosen.K_bar, found.chosen.H_bar)
+    np.testing.assert_allclose(stacked_links(problem, K, H)[0], found.chosen.K_bar, atol=1e-12)
+
+
+def test_a_start_that_is_not_mean_square_stable_leads_to_gains_that_are() -> None:
+    """The barrier is finite over 30 steps, however fast the errors grow."""
+    problem = real_network(random_problem(5, n=2), seen=True, delivery=0.6, unbiased=True, radius=1.3)
+    start = consensus_gains(problem, weight=0.9)
+    assert not exact_gain(error_model(problem, *start)).stable
+    found = descend(problem, {"too much consensus": start})
+    assert found.chosen.gain.stable
+
+
+def alone(beta: float) -> Problem:
+    """One node before x+ = 2 x + w; no gains are mean-square stable unless beta > 1 - 1 / 2^2 = 0.75."""
+    node = {"name": "only", "C": [[1.0]], "D": [[0.0, 0.1]], "arrival_probability": beta, "loss": "seen"}
+    return Problem.from_document(
+        {
+            "name": "alone",
+            "plant": {"A": [[2.0]], "B": [[1.0, 0.0]], "M": [[1.0]]},
+            "node": [node],
+            "topology": [{"name": "always", "adjacency": [[1.0]]}],
+            "markov": {"transition": [[1.0]], "initial": "always"},
+            "unbiased": True,
+        }
+    )
+
+
+def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_is_no_design() -> None:
+    """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
+    assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
+    with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
+        design_exact(alone(0.7))
+
+
+def test_a_plant_that_nobody_sees_grow_is_refused_in_one_sentence() -> None:
+    document = alone(1.0).document()
+    document["node"][0]["C"] = [[0.0]]
+    with pytest.raises(Unattainable, match="all sensors together do not show an unstable part"):
+        design_exact(Problem.from_document(document))
 
 
 @pytest.mark.parametrize(("name", "target"), [("zhu2020-ideal", 0.2700), ("zhu2020-lossy", 0.2456)])
