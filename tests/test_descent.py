@@ -181,7 +181,7 @@ def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_
     """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
     assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
     with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
-        design_exact(alone(0.7))
+        design_exact(alone(0.7), starts={"least variance": least_variance_gains(alone(0.7))})
 
 
 def test_a_plant_that_nobody_sees_grow_is_refused_in_one_sentence() -> None:
