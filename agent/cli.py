@@ -219,8 +219,8 @@ def _role(
 
 
 def _plan_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--steps", type=_count, default=200, metavar="N", help="how many steps (200)")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of modes, losses, disturbance (0)")
+    parser.add_argument("--steps", type=count, default=200, metavar="N", help="how many steps (200)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of modes, losses, disturbance (0)")
     parser.add_argument(
         "--window", type=_window, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
     )
@@ -284,7 +284,8 @@ def _whole(text: str, *, least: int, most: int) -> int:
     return int(text)
 
 
-def _count(text: str) -> int:
+def count(text: str) -> int:
+    """The type of options that say how many."""
     return _whole(text, least=1, most=2**31 - 1)
 
 
@@ -292,7 +293,8 @@ def _window(text: str) -> int:
     return _whole(text, least=1, most=LARGEST_WINDOW)
 
 
-def _seed(text: str) -> int:
+def seed(text: str) -> int:
+    """The type of --seed."""
     return _whole(text, least=0, most=2**63 - 1)
 
 

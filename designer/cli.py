@@ -12,7 +12,7 @@ from importlib.metadata import version
 
 import agent.cli
 from agent.contract.errors import EXIT_INPUT
-from designer.commands import analyse, design, recordings, reproduce, runs, show, verify
+from designer.commands import analyse, design, recordings, reproduce, runs, show, simulate, verify
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verify.add_verify(commands)
     runs.add_run(commands)
     recordings.add_replay(commands)
+    simulate.add_simulate(commands)
     recordings.add_report(commands)
     reproduce.add_reproduce(commands)
     show.add_show(commands)

@@ -22,6 +22,7 @@ from designer.exact_design import design_exact, with_ladder
 from designer.inwards import inwards
 from designer.lmi import LmiSolution
 from designer.lmi.units import spectral_radius
+from designer.worst_case import with_worst_case
 
 
 class Designed(NamedTuple):
@@ -45,13 +46,13 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
     if not problem.plant.M.any():
         raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
     if method == EXACT:
-        return design_exact(problem, progress=progress)
+        return with_worst_case(design_exact(problem, progress=progress))
     started = time.perf_counter()
     solution = METHODS[method](problem)
     solved = time.perf_counter()
     K, H, confirmed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(problem, solution)
     ended = time.perf_counter()
-    return Gains(
+    gains = Gains(
         problem=problem,
         problem_digest=problem.digest(),
         method=method,
@@ -61,6 +62,7 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
         solver=solution.solver,
         seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
     )
+    return with_worst_case(gains)
 
 
 def recover(problem: Problem, solution: LmiSolution) -> tuple[Array, Array]:

@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from designer.error_model import ErrorModel, realised
+from agent.contract.gains import Gains
+from agent.contract.problem import WorstCase
+from designer.error_model import ErrorModel, error_model, realised, stacked_gains
 from designer.gain import Operator
 from designer.sensitivity import critical, critical_sweep
+
+_SETTLED = 1e-4  # twice the horizon adds less to the worst gain, relatively
+_MOST_ROWS = 256  # of the largest matrix whose eigenvalues are sought, T nw: about a second
+_MOST_NUMBERS = 2e7  # that the mean responses to every w(j) may take: 160 MB
 
 
 class Policy(NamedTuple):
@@ -66,6 +72,31 @@ def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Distu
         if eigenvalues[-1] > best.gain**2:
             best = Disturbance(math.sqrt(eigenvalues[-1]), vectors[:, -1].reshape(T, nw))
     return best
+
+
+def worst_for(gains: Gains) -> Disturbance:
+    """The worst fixed w of gains from their initial mode, over a horizon that is doubled until the gain has settled.
+
+    At the longest horizon that is affordable the search ends, settled or not; `gain` is true of `w` in any case.
+    """
+    model = error_model(gains.problem, *stacked_gains(gains))
+    initial = gains.problem.mode_index(gains.problem.markov.initial)
+    most = int(min(_MOST_ROWS / model.nw, (2.0 * _MOST_NUMBERS / (model.modes * model.size * model.nw)) ** 0.5))
+    horizon = max(1, min(8, most))
+    worst = worst_disturbance(model, initial=initial, horizon=horizon)
+    while horizon < most:
+        horizon = min(2 * horizon, most)
+        before, worst = worst, worst_disturbance(model, initial=initial, horizon=horizon)
+        if worst.gain <= before.gain * (1.0 + _SETTLED):
+            break
+    return worst
+
+
+def with_worst_case(gains: Gains) -> Gains:
+    """The gains with the sequence of the disturbance kind "worst-case" where their problem asks for that one."""
+    if not isinstance(gains.problem.disturbance, WorstCase):
+        return gains
+    return gains.model_copy(update={"worst_case": worst_for(gains).w})
 
 
 def _traces_of_w(operator: Operator, model: ErrorModel, initial: int, horizon: int) -> list[tuple[Array, Array]]:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the program does; two tests at a time take both cores
+
 import pytest
 from hypothesis import settings
 from made_recordings import random_gains, random_problem
@@ -17,3 +22,18 @@ settings.load_profile("repeatable")
 def gains() -> Gains:
     """Three nodes with 1, 2 and 1 measurements, two modes, weights that differ from 1."""
     return random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[str]:
+    """The address of a cluster with two workers, each a process."""
+    import dask
+    from distributed import LocalCluster
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),  # a job that kills its worker is not repeated
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+        ) as local,
+    ):
+        yield local.scheduler_address

@@ -173,7 +173,7 @@ def simulate(
     A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
     chain, losses = schedule.modes(problem, seed=seed), schedule.Losses(problem, seed=seed)
     deliveries = schedule.Deliveries(problem, seed=seed)
-    source, sent = schedule.DisturbanceSource(problem, seed=seed), _Numbered()
+    source, sent = schedule.DisturbanceSource(problem, seed=seed, worst_case=gains.worst_case), _Numbered()
     x, mode = np.zeros(problem.nx), ""
     x_hat = {name: np.zeros(problem.nx) for name in problem.node_names}
     heard: dict[str, list[str]] = {name: [] for name in problem.node_names}

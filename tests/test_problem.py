@@ -311,7 +311,7 @@ REFUSED = [
     # disturbances
     (edited(SINE, "decay = 0.2"), 'disturbance: "kind" is missing'),
     (edited(SINE, 'kind = "sine"'),
-     'disturbance: kind "sine" is not known; there are "damped-sine", "impulse", "white", "csv", "none"'),
+     'disturbance: kind "sine" is not known; there are "damped-sine", "impulse", "white", "csv", "worst-case", "none"'),
     (edited("decay = 0.2", ""), 'disturbance: "decay" is missing'),
     (edited("decay = 0.2", "decay = -1"), "disturbance: decay: must be at least 0, got -1"),
     (edited("decay = 0.2", 'decay = "1"'), "disturbance: decay: must be a number, got '1'"),

@@ -133,21 +133,6 @@ def test_less_than_one_process_is_refused() -> None:
 
 
 # on a Dask cluster
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """The address of a cluster with two workers, each a process."""
-    import dask
-    from distributed import LocalCluster
-
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),  # a job that kills its worker is not repeated
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0"
-        ) as local,
-    ):
-        yield local.scheduler_address
-
-
 def test_a_cluster_gives_the_results_in_order(cluster: str) -> None:
     done = list(each(where, range(12), dask=cluster))
     assert [item for item, _ in done] == list(range(12))

@@ -68,6 +68,9 @@ class Gains(Model):
     certificate: Certificate
     solver: Solver
     seconds: dict[str, Number]  # of each phase of the design, and "total"
+    worst_case: Matrix | None = (
+        None  # (steps, nw), energy 1: the worst w that is fixed beforehand, where it is asked for
+    )
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -132,6 +135,15 @@ class Gains(Model):
     @model_validator(mode="after")
     def _check_links(self) -> Self:
         check_links(self.problem, self.K, self.H)
+        return self
+
+    @model_validator(mode="after")
+    def _check_worst_case(self) -> Self:
+        if self.worst_case is not None and self.worst_case.shape[1] != self.problem.nw:
+            raise ValueError(
+                f"worst_case is {shape_text(self.worst_case)}; it needs a column for each disturbance of the plant, "
+                f"{self.problem.nw}"
+            )
         return self
 
 

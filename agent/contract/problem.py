@@ -157,13 +157,20 @@ class Samples(Model):
     values: Matrix
 
 
+class WorstCase(Model):
+    """w(k) is `amplitude` times the sequence of energy 1 that is worst for the gains; their file has it."""
+
+    kind: Literal["worst-case"]
+    amplitude: Number = 1.0
+
+
 class Quiet(Model):
     """w(k) = 0."""
 
     kind: Literal["none"] = "none"
 
 
-Disturbance = Annotated[DampedSine | Impulse | White | Samples | Quiet, Field(discriminator="kind")]
+Disturbance = Annotated[DampedSine | Impulse | White | Samples | WorstCase | Quiet, Field(discriminator="kind")]
 
 
 class Problem(Model):

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from agent.contract.problem import DampedSine, Impulse, Problem, Quiet, Samples, White
+from agent.contract.errors import InputError
+from agent.contract.problem import DampedSine, Impulse, Problem, Quiet, Samples, White, WorstCase
 
 MODES, LOSSES, DISTURBANCE, DELIVERIES = 1, 2, 3, 4  # the streams
 _BLOCK = 256  # steps drawn at once; results do not depend on it
@@ -88,10 +89,15 @@ class Deliveries:
 
 
 class DisturbanceSource:
-    """w(k), (nw,)."""
+    """w(k), (nw,). `worst_case` is that of the gains; InputError where the problem asks for it and they lack it."""
 
-    def __init__(self, problem: Problem, *, seed: int) -> None:
-        self._disturbance = problem.disturbance
+    def __init__(self, problem: Problem, *, seed: int, worst_case: Array | None = None) -> None:
+        if isinstance(problem.disturbance, WorstCase) and worst_case is None:
+            raise InputError(
+                'the problem asks for disturbance kind "worst-case", but the gains have no worst_case; '
+                "design them again"
+            )
+        self._disturbance, self._worst_case = problem.disturbance, worst_case
         self._nw = problem.nw
         self._stream = Stream(seed=seed, stream=DISTURBANCE, width=2 * problem.nw)
 
@@ -105,6 +111,9 @@ class DisturbanceSource:
                 return np.full(self._nw, amplitude if step == at else 0.0)
             case Samples(values=values):
                 return values[step].copy() if step < len(values) else np.zeros(self._nw)
+            case WorstCase(amplitude=amplitude):
+                assert self._worst_case is not None
+                return amplitude * self._worst_case[step] if step < len(self._worst_case) else np.zeros(self._nw)
             case White(deviation=deviation):
                 return deviation * normal(self._stream.at(step))
 

@@ -179,7 +179,7 @@ class Drawn(NamedTuple):
 def draw(log: Log, central: Central) -> Drawn:
     problem, steps = log.gains.problem, log.steps
     losses = schedule.Losses(problem, seed=log.seed)
-    disturbance = schedule.DisturbanceSource(problem, seed=log.seed)
+    disturbance = schedule.DisturbanceSource(problem, seed=log.seed, worst_case=log.gains.worst_case)
     return Drawn(
         np.fromiter(islice(schedule.modes(problem, seed=log.seed), steps), dtype=np.int64, count=steps),
         np.array([losses.at(k) for k in range(steps)]).reshape(steps, problem.n),

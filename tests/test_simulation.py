@@ -1,0 +1,376 @@
+"""Ensembles: each run is that run, and what they say of the mean is what the moments of the error model say."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import networks
+import numpy as np
+import pytest
+from made_recordings import Sent, random_gains, random_problem, simulate
+
+from agent.contract.arrays import Array
+from agent.contract.errors import InputError
+from agent.contract.gains import Certificate, Gains, Solver
+from agent.contract.problem import Problem
+from designer import simulation
+from designer.error_model import ErrorModel, error_model, link_gains, stacked_gains
+from designer.gain import exact_gain
+from designer.replay import log
+from designer.simulation import Ensemble, Network, network_of, states
+from designer.worst_case import Disturbance, worst_for
+
+GOLDEN = Path(__file__).parents[1] / "recordings" / "golden"
+
+
+def with_gains(problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float) -> Gains:
+    """A gains file that claims this gamma."""
+    K, H = link_gains(problem, K_bar, H_bar)
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method="test",
+        K=K,
+        H=H,
+        certificate=Certificate(gamma=gamma, kind="exact", form="full", holds=True, verified="nothing", margins={}),
+        solver=Solver(name="none", version="0", status="none", iterations=0, seconds=0.0),
+        seconds={"total": 0.0},
+    )
+
+
+def edited(gains: Gains, **changes: Any) -> Gains:
+    """The gains with parts of their problem replaced, by their names in the file."""
+    problem = Problem.from_document({**gains.problem.document(), **changes})
+    return Gains.model_validate({**dict(gains), "problem": problem, "problem_digest": problem.digest()})
+
+
+def model_of(gains: Gains) -> ErrorModel:
+    return error_model(gains.problem, *stacked_gains(gains))
+
+
+# one run
+def assert_is_run(gains: Gains, seed: int, *, modes: list[str], x: Array, x_hat: Array) -> None:
+    """Run 3 of an ensemble of 5 has these modes, x (steps, nx) and x_hat (steps, n nx)."""
+    network = network_of(gains, steps=len(x))
+    size = np.maximum(np.abs(x).max(axis=1), np.abs(x_hat).max(axis=1))
+    largest = np.maximum.accumulate(np.maximum(1.0, size))  # a recording knows e = x - x_hat to the rounding of both
+    for k, state in enumerate(states(network, range(seed - 3, seed + 2), steps=len(x))):
+        e = np.tile(x[k], gains.problem.n) - x_hat[k]
+        assert gains.problem.mode_names[state.mode[3]] == modes[k]
+        assert np.abs(state.e[3] - e).max() <= 1e-12 * largest[k], k
+        if network.carries_plant:
+            assert np.abs(state.x[3] - x[k]).max() <= 1e-12 * largest[k], k
+
+
+def assert_is_made_run(gains: Gains, sent: list[Sent], *, seed: int) -> None:
+    """The same of messages in the order of their steps."""
+
+    def column(topic: str, key: str) -> list[Any]:
+        return [message.document[key] for message in sent if message.topic == topic]
+
+    x_hat = np.hstack([column(f"node/{name}/estimate", "x_hat") for name in gains.problem.node_names])
+    assert_is_run(gains, seed, modes=column("mode", "mode"), x=np.array(column("plant/state", "x")), x_hat=x_hat)
+
+
+def test_a_run_of_the_ensemble_is_a_recording_of_real_processes() -> None:
+    live = log.load(GOLDEN / "zhu2020-lossy.mcap")
+    gains = live.gains
+    assert live.seed >= 3
+    modes = [live.modes.texts[number] for number in live.mode]
+    assert_is_run(gains, live.seed, modes=modes, x=live.x, x_hat=live.x_hat)
+
+
+@pytest.mark.parametrize("disturbance", [
+    {"kind": "white", "deviation": 2.0},
+    {"kind": "damped-sine", "decay": 0.05},
+    {"kind": "impulse", "at": 3},
+    {"kind": "csv", "file": "w.csv", "values": [[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]]},
+])  # fmt: skip
+def test_run_r_has_the_draws_of_a_live_run_with_seed_S_plus_r(disturbance: dict[str, Any]) -> None:
+    problem = random_problem(5, nx=3, nw=3, ny=(1, 2, 1, 3), modes=3)
+    gains = edited(random_gains(problem), disturbance=disturbance)
+    assert_is_made_run(gains, simulate(gains, steps=300, seed=9), seed=9)
+
+
+# the mean over runs
+def observers(problem: Problem) -> tuple[Array, Array]:
+    """K_bar, H_bar: each node is a Kalman predictor of what it hears, drawn towards the others' estimates; unbiased."""
+    A, n, nx = problem.plant.A, problem.n, problem.nx
+    ends = np.cumsum([0] + [len(node.C) for node in problem.nodes])
+    K_bar = np.zeros((len(problem.topologies), n, nx, n, nx))
+    H_bar = np.zeros((len(problem.topologies), n, nx, ends[-1]))
+    for s in range(len(problem.topologies)):
+        for i in range(n):
+            heard = problem.neighbours(s, i)
+            C, P = np.vstack([problem.nodes[j].C for j in heard]), np.eye(nx)
+            for _ in range(100):
+                L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.eye(len(C)))
+                P = A @ P @ A.T + np.eye(nx) - L @ C @ P @ A.T
+            H_bar[s, i][:, np.concatenate([np.arange(ends[j], ends[j + 1]) for j in heard])] = L
+            K_bar[s, i, :, heard] = 0.3 * A / len(heard)
+            K_bar[s, i, :, i] += A - K_bar[s, i].sum(axis=1)
+    return K_bar.reshape(-1, n * nx, n * nx), H_bar.reshape(-1, n * nx, ends[-1])
+
+
+def sticky(**changes: Any) -> Problem:
+    """Two nodes that seldom hear each other, the first one with half its measurements lost."""
+    document = {
+        "name": "sticky",
+        "plant": {"A": [[0.95]], "B": [[1.0, 0.0, 0.0]], "M": [[1.0]]},
+        "node": [
+            {"name": "good", "C": [[1.0]], "D": [[0.0, 0.2, 0.0]], "arrival_probability": 0.5},
+            {"name": "poor", "C": [[0.01]], "D": [[0.0, 0.0, 1.0]], "arrival_probability": 1.0},
+        ],
+        "topology": [{"name": "together", "hears": {"poor": ["good"]}}, {"name": "apart", "hears": {}}],
+        "markov": {"transition": [[0.9, 0.1], [0.05, 0.95]], "initial": "together"},
+    }
+    return Problem.from_document({**document, **changes})
+
+
+def network_gains(problem: Problem, *, gamma: float = 1.0) -> Gains:
+    return with_gains(problem, *observers(problem), gamma=gamma)
+
+
+CASES = {
+    "paper": lambda: Gains.load(GOLDEN / "zhu2020-lossy.gains.json"),
+    "hidden": lambda: network_gains(networks.random_problem(1)),
+    "sticky": lambda: network_gains(sticky()),
+    "seen and lossy links": lambda: network_gains(
+        networks.real_network(networks.random_problem(2), seen=True, delivery=0.7)
+    ),
+    "some seen, unbiased": lambda: network_gains(
+        networks.real_network(networks.random_problem(3), seen=["n1"], delivery=0.8, unbiased=True)
+    ),
+    "unstable": lambda: network_gains(
+        networks.real_network(networks.random_problem(0), seen=True, delivery=0.8, unbiased=True, radius=1.05)
+    ),
+}
+DISTURBANCES = [{"kind": "white", "deviation": 0.7}, {"kind": "damped-sine", "decay": 0.1}]
+
+
+def mean_squares(gains: Gains, *, steps: int) -> Array:
+    """E|z_tilde(k)|^2, (steps,), by the moments of (10): no simulation, and none of its arithmetic."""
+    model, problem = model_of(gains), gains.problem
+    network = network_of(gains, steps=steps)
+    noise = [[(a, model.F_i(s, i)) for i, a in enumerate(model.alpha)] for s in range(model.modes)]
+    for term in range(0 if model.links is None else len(model.links.mode)):
+        assert model.links is not None
+        noise[model.links.mode[term]].append((model.links.variance[term], model.V_l(term)))
+    p = np.eye(model.modes)[problem.mode_index(problem.markov.initial)]
+    m, S = np.zeros((model.modes, model.size)), np.zeros((model.modes, model.size, model.size))
+    found = []
+    for k in range(steps):
+        found.append(float(np.trace(model.M @ S.sum(axis=0) @ model.M.T)))
+        m_next, S_next = np.zeros_like(m), np.zeros_like(S)
+        w = np.zeros(problem.nw) if isinstance(network.w, float) else network.w[k]
+        ww = network.w**2 * np.eye(problem.nw) if isinstance(network.w, float) else np.outer(w, w)
+        for s in range(model.modes):
+            joint = np.block([[S[s], np.outer(m[s], w)], [np.outer(w, m[s]), p[s] * ww]])
+            AB = np.hstack([model.A[s], model.B[s]])
+            moved = AB @ joint @ AB.T + sum(variance * V @ joint @ V.T for variance, V in noise[s])
+            m_next += np.outer(model.transition[s], AB @ np.concatenate([m[s], p[s] * w]))
+            S_next += model.transition[s][:, None, None] * moved
+        p, m, S = p @ model.transition, m_next, S_next
+    return np.array(found)
+
+
+def holds_the_truth(gains: Gains, truth: Array, *, runs: int = 3000) -> bool:
+    """The intervals of all steps hold the true means."""
+    ensemble = simulation.simulate(gains, runs=runs, steps=len(truth), processes=1)
+    rounding = 1e-9 * truth  # where nothing depends on chance
+    return bool(((ensemble.low - rounding <= truth) & (truth <= ensemble.high + rounding)).all())
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("disturbance", DISTURBANCES, ids=lambda disturbance: disturbance["kind"])
+def test_the_intervals_hold_the_moments_of_the_error_model(case: str, disturbance: dict[str, Any]) -> None:
+    gains = edited(CASES[case](), disturbance=disturbance)
+    truth = mean_squares(gains, steps=30)
+    assert truth[1:].min() >= 0.0
+    assert truth.max() > 0.0
+    assert holds_the_truth(gains, truth)
+    assert not holds_the_truth(gains, 1.1 * truth)
+
+
+# what a wrong simulation is found by
+def stationary(network: Network) -> Network:
+    """Modes that are independent from step to step, each as frequent as in the chain."""
+    transition = np.diff(network.cumulative, prepend=0.0, axis=1)
+    share = np.linalg.matrix_power(transition, 10_000)
+    return dataclasses.replace(network, cumulative=np.cumsum(share, axis=1))
+
+
+WRONG_NETWORKS: dict[str, Callable[[Network], Network]] = {
+    "modes are independent": stationary,
+    "another first mode": lambda network: dataclasses.replace(network, initial=1 - network.initial),
+    "losses are seen": lambda network: dataclasses.replace(network, seen=np.ones_like(network.seen)),
+}
+WRONG_DRAWS: dict[str, Callable[[Network], Network]] = {
+    "losses too rare": lambda network: dataclasses.replace(network, beta=1.0 - (1.0 - network.beta) * 0.7),
+    "losses too frequent": lambda network: dataclasses.replace(network, beta=network.beta * 0.8),
+    "no link loses messages": lambda network: dataclasses.replace(network, rho=np.ones_like(network.rho)),
+}
+WRONG_SEEDS: dict[str, Callable[[range], list[int]]] = {
+    "all runs alike": lambda seeds: [seeds[0]] * len(seeds),
+}
+MUTANTS = [*WRONG_NETWORKS, *WRONG_DRAWS, *WRONG_SEEDS]
+
+
+def plant_mutant(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the simulation wrong in this way."""
+    network, draws = simulation.network_of, simulation._draws
+    wrong_network, wrong_draws = WRONG_NETWORKS.get(name), WRONG_DRAWS.get(name)
+    wrong_seeds = WRONG_SEEDS.get(name)
+    if wrong_network is not None:
+        monkeypatch.setattr(simulation, "network_of", lambda *a, **b: wrong_network(network(*a, **b)))
+    if wrong_draws is not None:
+        monkeypatch.setattr(simulation, "_draws", lambda net, seeds, steps: draws(wrong_draws(net), seeds, steps))
+    if wrong_seeds is not None:
+        monkeypatch.setattr(simulation, "_draws", lambda net, seeds, steps: draws(net, wrong_seeds(seeds), steps))
+
+
+LOSSY_LINK = [{"receiver": "poor", "sender": "good", "delivery_probability": 0.5}]
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_the_moments_find_a_wrong_simulation(mutant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = edited(network_gains(sticky(link=LOSSY_LINK)), disturbance={"kind": "white", "deviation": 1.0})
+    truth = mean_squares(gains, steps=40)
+    assert holds_the_truth(gains, truth)
+    plant_mutant(mutant, monkeypatch)
+    assert not holds_the_truth(gains, truth)
+
+
+# the worst fixed disturbance
+@cache
+def case_of(name: str) -> tuple[Gains, Disturbance]:
+    """The gains of a case, claiming their exact gain, and the disturbance that is worst for them."""
+    gains = CASES[name]()
+    certificate = gains.certificate.model_copy(update={"gamma": exact_gain(model_of(gains)).high})
+    return gains.model_copy(update={"certificate": certificate}), worst_for(gains)
+
+
+def comes_close(gains: Gains, worst: Disturbance, *, runs: int = 4000) -> bool:
+    """Driven by the worst case, the mean at its peak step is gain^2 within 3 %, and gamma is nowhere exceeded."""
+    ensemble = simulation.simulate(gains, runs=runs, steps=len(worst.w) + 5, w=worst.w, processes=1)
+    peak = len(worst.w)
+    near = abs(ensemble.mean[peak] / worst.gain**2 - 1.0) < 0.03
+    return near and ensemble.mean.argmax() == peak and bool((ensemble.low <= ensemble.bound).all())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_worst_case_comes_close_to_the_gain_and_never_exceeds_gamma(case: str) -> None:
+    gains, worst = case_of(case)
+    assert worst.gain <= gains.certificate.gamma
+    assert comes_close(gains, worst)
+    too_low = gains.certificate.model_copy(update={"gamma": 0.9 * worst.gain})
+    refuted = simulation.simulate(
+        gains.model_copy(update={"certificate": too_low}), runs=4000, steps=len(worst.w) + 5, w=worst.w, processes=1
+    )
+    assert refuted.least[len(worst.w)] > refuted.bound[len(worst.w)]
+    assert refuted.refuted_at is not None
+
+
+@pytest.mark.parametrize("mutant", ["modes are independent", "losses too rare", "losses too frequent"])
+def test_the_worst_case_finds_a_wrong_simulation(mutant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gains, worst = case_of("sticky")
+    assert comes_close(gains, worst)
+    plant_mutant(mutant, monkeypatch)
+    assert not comes_close(gains, worst)
+
+
+# what is refuted, and what is not
+def ensemble_of(sizes: Array, *, gamma: float = 1.0) -> Ensemble:
+    """What is said of |z_tilde(k)|^2 = sizes (runs, steps), told in three parts, with energy 1 before every step."""
+    runs, steps = sizes.shape
+    ignored = math.ceil(math.sqrt(runs * math.log(steps / 0.01) / 2.0))
+    found = None
+    for rows in np.array_split(sizes, min(3, runs)):
+        part = rows.T
+        largest, others = simulation._set_apart(part, ignored)
+        squares = ((part - part.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+        tally = simulation.Tally(part.shape[1], part.mean(axis=1), squares, largest, others, np.sqrt(part.max(axis=0)))
+        found = tally if found is None else simulation._together(found, tally, ignored)
+    assert found is not None
+    return simulation._ensemble(gamma, found, np.ones(steps))
+
+
+def test_parts_together_are_the_whole() -> None:
+    sizes = np.random.default_rng(1).lognormal(size=(200, 3))
+    ensemble = ensemble_of(sizes)
+    kept = 200 - math.ceil(math.sqrt(200 * math.log(3 / 0.01) / 2.0))
+    half = 2.9352 * sizes.std(axis=0, ddof=1) / math.sqrt(200)  # 1 - 0.01 / 6 of the normal distribution lie below
+    assert np.allclose(ensemble.mean, sizes.mean(axis=0), rtol=1e-12)
+    assert np.allclose(ensemble.high - ensemble.mean, half, rtol=1e-4)
+    assert np.allclose(ensemble.mean - ensemble.low, half, rtol=1e-4)
+    assert np.allclose(ensemble.least, np.sort(sizes, axis=0)[:kept].sum(axis=0) / 200, rtol=1e-12)
+    assert np.allclose(ensemble.peaks, np.sqrt(sizes.max(axis=1)))
+
+
+@pytest.mark.parametrize("runs", [2, 10, 100, 1000])
+@pytest.mark.parametrize("heavy", [False, True])
+def test_chance_does_not_refute_what_is_true(runs: int, heavy: bool) -> None:
+    """Means that are attained exactly: by values of which one in fifty is 0, and by heavy tails without variance."""
+    rng, refuted = np.random.default_rng(runs), 0
+    for _ in range(200):
+        u = rng.random((runs, 1))
+        sizes = (1.0 - u) ** (-1.0 / 1.5) / 3.0 if heavy else (u < 0.98) / 0.98  # Pareto's, exponent 1.5; both mean 1
+        refuted += ensemble_of(sizes).refuted_at is not None
+    assert refuted <= 6  # of 200, where one in a hundred is what may happen
+
+
+def test_what_is_clearly_too_much_is_refuted() -> None:
+    sizes = np.random.default_rng(2).exponential(size=(1000, 4)) * [0.5, 0.9, 1.5, 0.1]
+    ensemble = ensemble_of(sizes)
+    assert ensemble.refuted_at == 2
+    assert ensemble_of(sizes, gamma=1.4).refuted_at is None
+
+
+def test_errors_beyond_float64_refute() -> None:
+    """Gains that let errors grow without end."""
+    gains = with_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)), gamma=1.0)
+    ensemble = simulation.simulate(gains, runs=20, steps=400, w=np.ones((1, 3)), processes=1)
+    assert np.isinf(ensemble.mean[-1])
+    assert ensemble.refuted_at is not None
+
+
+def test_nothing_is_refuted_without_a_disturbance() -> None:
+    ensemble = simulation.simulate(network_gains(sticky()), runs=10, steps=5)
+    assert ensemble.mean.tolist() == [0.0] * 5
+    assert (ensemble.closest, ensemble.refuted_at) == (None, None)
+
+
+# where the runs are computed
+def equal(one: Ensemble, other: Ensemble) -> bool:
+    return all(
+        np.array_equal(getattr(one, field.name), getattr(other, field.name)) for field in dataclasses.fields(one)
+    )
+
+
+def test_figures_do_not_depend_on_who_computes_them(monkeypatch: pytest.MonkeyPatch, cluster: str) -> None:
+    """One process, several, or a cluster."""
+    monkeypatch.setattr(simulation, "CHUNK", 30)
+    gains, done = CASES["seen and lossy links"](), list[int]()
+    gains = edited(gains, disturbance=DISTURBANCES[0])
+    alone = simulation.simulate(gains, runs=100, steps=50, seed=3, processes=1, progress=done.append)
+    assert done == [30, 60, 90, 100]
+    assert equal(alone, simulation.simulate(gains, runs=100, steps=50, seed=3, processes=2))
+    assert equal(alone, simulation.simulate(gains, runs=100, steps=50, seed=3, dask=cluster))
+    assert not equal(alone, simulation.simulate(gains, runs=100, steps=50, seed=4, processes=1))
+
+
+def test_numbers_are_drawn_in_blocks_that_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    gains = edited(CASES["hidden"](), disturbance=DISTURBANCES[0])
+    whole = simulation.simulate(gains, runs=10, steps=50, processes=1)
+    monkeypatch.setattr(simulation, "NUMBERS", 700)
+    assert equal(whole, simulation.simulate(gains, runs=10, steps=50, processes=1))
+
+
+def test_one_run_is_no_ensemble() -> None:
+    with pytest.raises(InputError, match="runs is 1; an interval for the mean takes at least 2"):
+        simulation.simulate(network_gains(sticky()), runs=1, steps=5)
