@@ -289,6 +289,21 @@ def test_a_millionth_in_an_estimate_is_found(tmp_path: Path, node: str, step: in
     )
 
 
+def test_the_smallest_change_that_is_found_is_near_the_tolerance(tmp_path: Path) -> None:
+    def grow(document: dict[str, Any]) -> None:
+        document["x_hat"][1] += 100 * tolerance(PROBLEM) * max(1.0, abs(document["x_hat"][1]))
+
+    verdict = verdict_of(tmp_path, changed("node/n2/estimate", 33, grow))
+    assert_found(verdict, step=33, node="n2", field="x_hat[1]", proof=2)
+
+
+@pytest.mark.parametrize("cut", [1, 100, 333, 507])
+def test_a_cut_file_agrees_as_far_as_it_goes(tmp_path: Path, cut: int) -> None:
+    """What the last estimates heard is not in it: the seed decides there."""
+    verdict = verdict_of(tmp_path, TRUE[:cut], whole=False)
+    assert (verdict.agrees, verdict.finished, verdict.exit_code) == (True, False, 3), verdict.text()
+
+
 def test_a_jump_hidden_behind_missing_messages_is_found_by_the_free_run(tmp_path: Path) -> None:
     jumped = simulate(GAINS, steps=STEPS, nudge=(20, "n1", 1e-6))
     verdict = verdict_of(

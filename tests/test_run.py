@@ -42,6 +42,7 @@ from designer.replay import replay
 from designer.replay.verdict import Verdict
 
 MANY = 100_000  # steps of a run that a test ends itself
+SENSOR = Path(__file__).parents[1] / "docs" / "sensor.py"
 
 
 @pytest.fixture(scope="session")
@@ -360,25 +361,21 @@ def test_files_of_the_current_folder_are_not_imported(
 
 
 # Sensors of one's own.
-def test_sensor_of_ones_own(gains_path: Path, tmp_path: Path, gains: Gains) -> None:
-    """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
-    script = Path(__file__).parents[1] / "docs" / "sensor.py"
-    lines = [line for line in script.read_text().splitlines() if line.strip()]
-    assert len(lines) < 20
-    assert not any("peakmesh import" in line or "import agent" in line for line in lines)
-    name = gains.problem.node_names[0]
-    recording = tmp_path / "run.mcap"
+def measured_by(
+    script: Path, gains_path: Path, recording: Path, *, node: str, steps: int
+) -> list[tuple[int, list[float]]]:
+    """Run with a sensor script for one node; step and y of its measurements. Nothing is missing, the replay agrees."""
     sensor: list[subprocess.Popen[bytes]] = []
 
     def start_sensor(word: dict[str, Any]) -> None:
         if "listening" in word:
-            sensor.append(subprocess.Popen([sys.executable, script, "own", name, word["listening"][0]]))
+            sensor.append(subprocess.Popen([sys.executable, script, "own", node, word["listening"][0]]))
 
     try:
         summary = launch(
             gains_path,
-            gains,
-            Plan(steps=60, seed=1, external=(name,)),
+            Gains.load(gains_path),
+            Plan(steps=steps, seed=1, external=(node,)),
             run="own",
             recording=recording,
             force=False,
@@ -391,9 +388,31 @@ def test_sensor_of_ones_own(gains_path: Path, tmp_path: Path, gains: Gains) -> N
             process.kill()
             process.wait()
     assert summary["missing"] == 0
-    measured = [decoded(m) for m in logged(recording) if m.topic == f"node/{name}/measurement"]
-    assert [(m.step, getattr(m, "y")) for m in measured] == [(k, [0.0]) for k in range(60)]  # noqa: B009
     assert judged(recording).exit_code == 0
+    documents = [json.loads(m.payload) for m in logged(recording) if m.topic == f"node/{node}/measurement"]
+    return [(document["step"], document["y"]) for document in documents]
+
+
+def test_sensor_of_ones_own(gains_path: Path, tmp_path: Path, gains: Gains) -> None:
+    """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
+    lines = [line for line in SENSOR.read_text().splitlines() if line.strip()]
+    assert len(lines) < 20
+    assert not any("peakmesh import" in line or "import agent" in line for line in lines)
+    name = gains.problem.node_names[0]
+    measured = measured_by(SENSOR, gains_path, tmp_path / "run.mcap", node=name, steps=60)
+    assert measured == [(k, [0.0]) for k in range(60)]
+
+
+def test_sensor_that_has_nothing_to_say(tmp_path: Path) -> None:
+    """At every third step it publishes [], which a node that sees its losses takes for what it is."""
+    problem, script, reading = real_problem(5, radius=1.02, ny=(1, 2, 1)), tmp_path / "sensor.py", '"y": [0.0]'
+    assert problem.nodes[2].seen
+    observer_gains(problem).save(tmp_path / "gains.json")
+    text = SENSOR.read_text()
+    assert text.count(reading) == 1
+    script.write_text(text.replace(reading, '"y": [0.5] if json.loads(mode)["step"] % 3 else []'))
+    measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n2", steps=30)
+    assert measured == [(k, [0.5] if k % 3 else []) for k in range(30)]
 
 
 # Bad input.

@@ -115,7 +115,7 @@ class Central:
         """(modes, n_eta, n_eta): 1 where an entry of eta(k) may enter one of eta(k+1), else 0."""
         model, p = self.model, self.model.plant_states
         touches = model.A != 0.0
-        touches[:, p:] |= (model.H != 0.0) @ (model.R[:, : model.size] != 0.0)
+        touches[:, p:] |= np.abs(model.H) @ np.abs(model.R[:, : model.size]) != 0.0
         links = model.links
         if links is not None:
             nx = self.problem.nx
@@ -189,10 +189,11 @@ def draw(log: Log, central: Central) -> Drawn:
 
 
 def _drawn_deliveries(log: Log, central: Central) -> Flags:
-    if not log.gains.problem.links:
-        return np.empty((log.steps, 0), dtype=bool)
-    deliveries = schedule.Deliveries(log.gains.problem, seed=log.seed)
-    return np.array([deliveries.at(k)[central.links] for k in range(log.steps)]).reshape(log.steps, -1)
+    drawn = np.empty((log.steps, len(central.links[0])), dtype=bool)
+    if drawn.size:
+        deliveries = schedule.Deliveries(log.gains.problem, seed=log.seed)
+        drawn[:] = [deliveries.at(k)[central.links] for k in range(log.steps)]
+    return drawn
 
 
 def logged_inputs(log: Log, central: Central, drawn: Drawn) -> Inputs:
