@@ -120,8 +120,8 @@ class Central:
         if links is not None:
             nx = self.problem.nx
             for s, i, columns, V_l in zip(links.mode, links.receiver, links.columns, links.V, strict=True):
-                here = columns < model.size
-                touches[s, p + i * nx : p + (i + 1) * nx, columns[here]] |= (V_l[:, here] != 0.0).T
+                rows, here = touches[s, p + i * nx : p + (i + 1) * nx], columns < model.size
+                rows[:, columns[here]] |= V_l[:, here] != 0.0
         return np.asarray(touches, dtype=np.float64)
 
     def owner(self, width: int) -> Numbers:
