@@ -1,8 +1,8 @@
 """The error model in ball arithmetic, built link by link from the numbers of the gains file as they stand.
 
 It shares no code with designer.error_model, and takes a_ij K_ij, beta(1 - beta) and A - sum of a_ij K_ij as exact
-products and sums of stored floats. In mode s (docs/theory.md, section 8, derives it; (10)(11) of the paper where
-losses are hidden and links keep their messages)
+products and sums of stored floats. In mode s (docs/theory.md derives it; it is (10)(11) of the paper where losses are
+hidden and no link loses messages)
 
     eta+ = [A B][eta; w] + sum over l of xi_l E_l C_l [eta; w],
 

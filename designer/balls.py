@@ -56,6 +56,38 @@ def add(matrix: arb_mat, rows: Sequence[int], columns: Sequence[int], block: arb
 def sign(S: arb_mat, sizes: Array) -> Sign:
     """Whether the exact symmetric matrix within S is positive definite; sizes: what its diagonal is measured by.
 
+    Where S falls apart into blocks, as (18) does by nodes, each is looked at by itself.
+    """
+    blocks = _blocks(S)
+    if len(blocks) == 1:
+        return _sign(S, sizes)
+    signs = [_sign(part(S, block, block), sizes[block]) for block in blocks]
+    return Sign(
+        proved=all(found.proved for found in signs),
+        refuted=any(found.refuted for found in signs),
+        least=min(found.least for found in signs),
+    )
+
+
+def _blocks(S: arb_mat) -> list[list[int]]:
+    """The indices of S, in sets between which every entry is exactly 0."""
+    joined = np.array([not entry.is_zero() for entry in S.entries()]).reshape(S.nrows(), S.ncols())
+    joined |= joined.T
+    left, blocks = np.ones(len(joined), dtype=bool), []
+    while left.any():
+        block = np.zeros(len(joined), dtype=bool)
+        reached = left & (np.cumsum(left) == 1)  # the first of those left
+        while reached.any():
+            block |= reached
+            reached = joined[reached].any(axis=0) & ~block
+        left &= ~block
+        blocks.append(np.flatnonzero(block).tolist())
+    return blocks
+
+
+def _sign(S: arb_mat, sizes: Array) -> Sign:
+    """The sign of one block.
+
     Floats find a congruence, balls prove: X holds the eigenvectors of the scaled midpoints, and G = X'SX is nearly
     diagonal. If there are d > 0 with G_ii d_i > sum over j != i of |G_ij| d_j for every i, then diag(d) G diag(d) is
     strictly diagonally dominant, so it is positive definite by Gershgorin's theorem, and so is S (if Sv were not

@@ -50,18 +50,9 @@ def model_of(gains: Gains) -> ErrorModel:
     return error_model(gains.problem, *stacked_gains(gains))
 
 
-def unbiased_gains(problem: Problem) -> tuple[Array, Array]:
-    """Kalman-consensus gains of the plant at a radius of 0.9 at most; what A has more goes to K_ii."""
-    stable = problem
-    if not problem.carries_plant:
-        stable = real_network(problem, radius=0.9)
-    K_bar, H_bar = consensus_gains(stable, weight=0.2)
-    return K_bar + np.kron(np.eye(problem.n), problem.plant.A - stable.plant.A), H_bar
-
-
 def certified(problem: Problem, kind: Kind) -> Gains:
     """Kalman-consensus gains with a certificate as tight as `design` makes it, by floats alone."""
-    K, H = link_gains(problem, *unbiased_gains(problem))
+    K, H = link_gains(problem, *consensus_gains(problem, weight=0.2))
     model = error_model(problem, *stacked_links(problem, K, H))
     gain = exact_gain(model)
     assert gain.P is not None
@@ -136,8 +127,9 @@ def permute_modes(document: Document) -> None:
 
 
 def change_transition(document: Document) -> None:
-    modes = len(document["problem"]["topology"])
-    document["problem"]["markov"]["transition"] = np.roll(np.eye(modes), 1, axis=0).tolist()
+    """Always to the mode where P is largest."""
+    traces = [np.trace(P) for P in document["certificate"]["P"].values()]
+    document["problem"]["markov"]["transition"] = np.eye(len(traces))[[np.argmax(traces)] * len(traces)].tolist()
 
 
 def make_P_indefinite(document: Document) -> None:
@@ -402,6 +394,20 @@ def test_a_singular_matrix_has_neither_sign() -> None:
     found = sign(exact(v @ v.T), (v @ v.T).diagonal())
     assert not found.proved
     assert not found.refuted
+
+
+def test_a_matrix_that_falls_apart_has_the_sign_of_its_blocks() -> None:
+    """Blocks mixed by a permutation: the least counts; a radius joins blocks whose entries between them are 0."""
+    order = [3, 0, 4, 1, 2]
+    for least, proved in ((1e-20, True), (-1e-20, False)):
+        S = np.diag([1.0, 1.0, 1.0, 2.0, least])
+        S[:2, :2] = [[1.0, 0.5], [0.5, 1.0]]
+        found = sign(exact(S[order][:, order]), np.ones(5))
+        assert (found.proved, found.refuted, found.least) == (proved, not proved, least)
+    joined = exact(np.diag([1e-3, 1e-3]))
+    assert sign(joined, np.ones(2)).proved
+    joined[0, 1] = joined[1, 0] = arb(0, 1e-2)
+    assert not sign(joined, np.ones(2)).proved
 
 
 def test_radii_count() -> None:
