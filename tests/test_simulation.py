@@ -2,45 +2,46 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
+import json
 import math
 from collections.abc import Callable
 from functools import cache
+from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import networks
 import numpy as np
 import pytest
-from made_recordings import Sent, random_gains, random_problem, simulate
+import runs
+from made_recordings import (
+    Sent,
+    observer_gains,
+    random_gains,
+    random_problem,
+    real_problem,
+    record,
+    simulate,
+    uncertified,
+)
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
-from agent.contract.gains import Certificate, Gains, Solver
+from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer import simulation
+from designer.cli import main
 from designer.error_model import ErrorModel, error_model, link_gains, stacked_gains
 from designer.gain import exact_gain
-from designer.replay import log
+from designer.replay import log, replay
 from designer.simulation import Ensemble, Network, network_of, states
-from designer.worst_case import Disturbance, worst_for
+from designer.worst_case import Disturbance, with_worst_case, worst_for
 
 GOLDEN = Path(__file__).parents[1] / "recordings" / "golden"
-
-
-def with_gains(problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float) -> Gains:
-    """A gains file that claims this gamma."""
-    K, H = link_gains(problem, K_bar, H_bar)
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
-        method="test",
-        K=K,
-        H=H,
-        certificate=Certificate(gamma=gamma, kind="exact", form="full", holds=True, verified="nothing", margins={}),
-        solver=Solver(name="none", version="0", status="none", iterations=0, seconds=0.0),
-        seconds={"total": 0.0},
-    )
 
 
 def edited(gains: Gains, **changes: Any) -> Gains:
@@ -85,38 +86,38 @@ def test_a_run_of_the_ensemble_is_a_recording_of_real_processes() -> None:
     assert_is_run(gains, live.seed, modes=modes, x=live.x, x_hat=live.x_hat)
 
 
-@pytest.mark.parametrize("disturbance", [
-    {"kind": "white", "deviation": 2.0},
-    {"kind": "damped-sine", "decay": 0.05},
-    {"kind": "impulse", "at": 3},
-    {"kind": "csv", "file": "w.csv", "values": [[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]]},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        {"kind": "white", "deviation": 2.0},
+        {"kind": "damped-sine", "decay": 0.05},
+        {"kind": "impulse", "at": 3},
+        {"kind": "csv", "file": "w.csv", "values": [[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]]},
+        {"kind": "worst-case", "amplitude": 3.0},
+    ],
+    ids=lambda disturbance: disturbance["kind"],
+)
 def test_run_r_has_the_draws_of_a_live_run_with_seed_S_plus_r(disturbance: dict[str, Any]) -> None:
     problem = random_problem(5, nx=3, nw=3, ny=(1, 2, 1, 3), modes=3)
-    gains = edited(random_gains(problem), disturbance=disturbance)
+    gains = with_worst_case(edited(random_gains(problem), disturbance=disturbance))
     assert_is_made_run(gains, simulate(gains, steps=300, seed=9), seed=9)
 
 
+@pytest.mark.parametrize(
+    ("radius", "seen", "links", "unbiased"),
+    [(0.85, *flags) for flags in product((False, True), repeat=3) if any(flags)]
+    + [(1.05, True, False, True), (1.05, True, True, True)],
+)
+def test_a_run_has_the_losses_that_nodes_see_and_the_messages_that_links_lose(
+    radius: float, seen: bool, links: bool, unbiased: bool
+) -> None:
+    """With an unstable plant the errors stay what they are while x grows."""
+    problem = real_problem(4, radius=radius, seen=seen, links=links, unbiased=unbiased)
+    gains = observer_gains(problem) if unbiased else random_gains(problem)
+    assert_is_made_run(gains, simulate(gains, steps=100, seed=11), seed=11)
+
+
 # the mean over runs
-def observers(problem: Problem) -> tuple[Array, Array]:
-    """K_bar, H_bar: each node is a Kalman predictor of what it hears, drawn towards the others' estimates; unbiased."""
-    A, n, nx = problem.plant.A, problem.n, problem.nx
-    ends = np.cumsum([0] + [len(node.C) for node in problem.nodes])
-    K_bar = np.zeros((len(problem.topologies), n, nx, n, nx))
-    H_bar = np.zeros((len(problem.topologies), n, nx, ends[-1]))
-    for s in range(len(problem.topologies)):
-        for i in range(n):
-            heard = problem.neighbours(s, i)
-            C, P = np.vstack([problem.nodes[j].C for j in heard]), np.eye(nx)
-            for _ in range(100):
-                L = A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.eye(len(C)))
-                P = A @ P @ A.T + np.eye(nx) - L @ C @ P @ A.T
-            H_bar[s, i][:, np.concatenate([np.arange(ends[j], ends[j + 1]) for j in heard])] = L
-            K_bar[s, i, :, heard] = 0.3 * A / len(heard)
-            K_bar[s, i, :, i] += A - K_bar[s, i].sum(axis=1)
-    return K_bar.reshape(-1, n * nx, n * nx), H_bar.reshape(-1, n * nx, ends[-1])
-
-
 def sticky(**changes: Any) -> Problem:
     """Two nodes that seldom hear each other, the first one with half its measurements lost."""
     document = {
@@ -132,21 +133,24 @@ def sticky(**changes: Any) -> Problem:
     return Problem.from_document({**document, **changes})
 
 
-def network_gains(problem: Problem, *, gamma: float = 1.0) -> Gains:
-    return with_gains(problem, *observers(problem), gamma=gamma)
+def claiming(gains: Gains, gamma: float) -> Gains:
+    """The gains with a certificate of this gamma."""
+    return gains.model_copy(
+        update={"certificate": gains.certificate.model_copy(update={"gamma": gamma, "holds": True})}
+    )
 
 
 CASES = {
     "paper": lambda: Gains.load(GOLDEN / "zhu2020-lossy.gains.json"),
-    "hidden": lambda: network_gains(networks.random_problem(1)),
-    "sticky": lambda: network_gains(sticky()),
-    "seen and lossy links": lambda: network_gains(
+    "hidden": lambda: observer_gains(networks.random_problem(1)),
+    "sticky": lambda: observer_gains(sticky()),
+    "seen and lossy links": lambda: observer_gains(
         networks.real_network(networks.random_problem(2), seen=True, delivery=0.7)
     ),
-    "some seen, unbiased": lambda: network_gains(
+    "some seen, unbiased": lambda: observer_gains(
         networks.real_network(networks.random_problem(3), seen=["n1"], delivery=0.8, unbiased=True)
     ),
-    "unstable": lambda: network_gains(
+    "unstable": lambda: observer_gains(
         networks.real_network(networks.random_problem(0), seen=True, delivery=0.8, unbiased=True, radius=1.05)
     ),
 }
@@ -239,7 +243,7 @@ LOSSY_LINK = [{"receiver": "poor", "sender": "good", "delivery_probability": 0.5
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_the_moments_find_a_wrong_simulation(mutant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    gains = edited(network_gains(sticky(link=LOSSY_LINK)), disturbance={"kind": "white", "deviation": 1.0})
+    gains = edited(observer_gains(sticky(link=LOSSY_LINK)), disturbance={"kind": "white", "deviation": 1.0})
     truth = mean_squares(gains, steps=40)
     assert holds_the_truth(gains, truth)
     plant_mutant(mutant, monkeypatch)
@@ -251,8 +255,7 @@ def test_the_moments_find_a_wrong_simulation(mutant: str, monkeypatch: pytest.Mo
 def case_of(name: str) -> tuple[Gains, Disturbance]:
     """The gains of a case, claiming their exact gain, and the disturbance that is worst for them."""
     gains = CASES[name]()
-    certificate = gains.certificate.model_copy(update={"gamma": exact_gain(model_of(gains)).high})
-    return gains.model_copy(update={"certificate": certificate}), worst_for(gains)
+    return claiming(gains, exact_gain(model_of(gains)).high), worst_for(gains)
 
 
 def comes_close(gains: Gains, worst: Disturbance, *, runs: int = 4000) -> bool:
@@ -268,10 +271,8 @@ def test_the_worst_case_comes_close_to_the_gain_and_never_exceeds_gamma(case: st
     gains, worst = case_of(case)
     assert worst.gain <= gains.certificate.gamma
     assert comes_close(gains, worst)
-    too_low = gains.certificate.model_copy(update={"gamma": 0.9 * worst.gain})
-    refuted = simulation.simulate(
-        gains.model_copy(update={"certificate": too_low}), runs=4000, steps=len(worst.w) + 5, w=worst.w, processes=1
-    )
+    claim = claiming(gains, 0.9 * worst.gain)
+    refuted = simulation.simulate(claim, runs=4000, steps=len(worst.w) + 5, w=worst.w, processes=1)
     assert refuted.least[len(worst.w)] > refuted.bound[len(worst.w)]
     assert refuted.refuted_at is not None
 
@@ -333,14 +334,15 @@ def test_what_is_clearly_too_much_is_refuted() -> None:
 
 def test_errors_beyond_float64_refute() -> None:
     """Gains that let errors grow without end."""
-    gains = with_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)), gamma=1.0)
+    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)))
+    gains = claiming(uncertified(sticky(), K, H, method="none"), 1.0)
     ensemble = simulation.simulate(gains, runs=20, steps=400, w=np.ones((1, 3)), processes=1)
     assert np.isinf(ensemble.mean[-1])
     assert ensemble.refuted_at is not None
 
 
 def test_nothing_is_refuted_without_a_disturbance() -> None:
-    ensemble = simulation.simulate(network_gains(sticky()), runs=10, steps=5)
+    ensemble = simulation.simulate(observer_gains(sticky()), runs=10, steps=5)
     assert ensemble.mean.tolist() == [0.0] * 5
     assert (ensemble.closest, ensemble.refuted_at) == (None, None)
 
@@ -373,4 +375,177 @@ def test_numbers_are_drawn_in_blocks_that_change_nothing(monkeypatch: pytest.Mon
 
 def test_one_run_is_no_ensemble() -> None:
     with pytest.raises(InputError, match="runs is 1; an interval for the mean takes at least 2"):
-        simulation.simulate(network_gains(sticky()), runs=1, steps=5)
+        simulation.simulate(observer_gains(sticky()), runs=1, steps=5)
+
+
+# the disturbance kind "worst-case": in a gains file, a live run, a replay
+def worst_gains(*, amplitude: float = 2.0) -> Gains:
+    """Gains of a problem that asks for its worst case, with it."""
+    problem = real_problem(2)
+    document = {**problem.document(), "disturbance": {"kind": "worst-case", "amplitude": amplitude}}
+    return with_worst_case(observer_gains(Problem.from_document(document)))
+
+
+def test_the_worst_case_is_stored_where_it_is_asked_for(tmp_path: Path) -> None:
+    gains = worst_gains()
+    assert gains.worst_case is not None
+    assert (gains.worst_case**2).sum() == pytest.approx(1.0)
+    gains.save(tmp_path / "gains.json")
+    assert Gains.load(tmp_path / "gains.json") == gains
+    asks_for_nothing = observer_gains(real_problem(2))
+    assert with_worst_case(asks_for_nothing) is asks_for_nothing
+    assert "worst_case" not in asks_for_nothing.document()
+
+
+def test_a_design_stores_the_worst_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = (files("designer.problems") / "two-nodes.toml").read_text()
+    head, _, _ = problem.partition("[disturbance]")
+    (tmp_path / "problem.toml").write_text(head + '[disturbance]\nkind = "worst-case"\n')
+    path = tmp_path / "gains.json"
+    assert main(["design", str(tmp_path / "problem.toml"), "--method", "decomposed", "-o", str(path)]) == 0
+    gains = Gains.load(path)
+    assert gains.worst_case is not None
+    assert np.array_equal(gains.worst_case, worst_for(gains).w)
+
+
+def test_the_worst_case_drives_a_live_run_and_replay_checks_it(tmp_path: Path) -> None:
+    """As processes; and the run is that of the ensemble."""
+    gains, recording = worst_gains(), tmp_path / "run.mcap"
+    gains.save(tmp_path / "gains.json")
+    ran = runs.peakmesh("run", tmp_path / "gains.json", "--steps", 40, "--seed", 5, "-o", recording)
+    assert ran.returncode == 0, ran.stderr
+    assert replay(recording).exit_code == 0
+    live = log.load(recording)
+    assert gains.worst_case is not None
+    assert np.array_equal(live.w[: len(gains.worst_case)], 2.0 * gains.worst_case[: len(live.w)])
+    modes = [live.modes.texts[number] for number in live.mode]
+    assert_is_run(gains, 5, modes=modes, x=live.x, x_hat=live.x_hat)
+
+
+def test_replay_finds_another_disturbance_than_the_worst(tmp_path: Path) -> None:
+    """A run that is right in all else, but was driven by w of the opposite sign."""
+    gains = worst_gains()
+    assert gains.worst_case is not None
+    opposite = gains.model_copy(update={"worst_case": -gains.worst_case})
+    sent = simulate(opposite, steps=30)
+    assert replay(record(tmp_path / "true.mcap", opposite, sent, steps=30)).exit_code == 0
+    first = replay(record(tmp_path / "false.mcap", gains, sent, steps=30)).first_divergence
+    assert first is not None
+    assert (first.proof, first.step, first.field) == (1, 0, "w[0]")
+
+
+def test_gains_that_lack_the_worst_case_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    claiming(worst_gains(), 100.0).model_copy(update={"worst_case": None}).save(tmp_path / "gains.json")
+    sentence = 'the problem asks for disturbance kind "worst-case", but the gains have no worst_case; design them again'
+    ran = runs.peakmesh("run", tmp_path / "gains.json", "--steps", 40, "-o", tmp_path / "run.mcap")
+    assert (ran.returncode, ran.stderr.strip()) == (2, f"peakmesh: {sentence}")
+    assert not (tmp_path / "run.mcap").exists()
+    assert main(["simulate", str(tmp_path / "gains.json")]) == 2
+    assert capsys.readouterr().err == f"peakmesh: {sentence}\n"
+    assert main(["simulate", str(tmp_path / "gains.json"), "--disturbance", "worst-case", "--runs", "50"]) == 0
+
+
+def test_a_worst_case_for_another_number_of_disturbances_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "gains.json"
+    worst_gains().model_copy(update={"worst_case": np.ones((4, 5))}).save(path)
+    with pytest.raises(InputError, match="worst_case is 4 x 5; it needs a column for each disturbance of the plant, 2"):
+        Gains.load(path)
+
+
+# the command
+def simulate_command(folder: Path, *arguments: object, gains: Gains) -> int:
+    """`peakmesh simulate`, in this process."""
+    gains.save(folder / "gains.json", force=True)
+    return main(["simulate", str(folder / "gains.json"), "--processes", "1", *map(str, arguments)])
+
+
+KEYS = {
+    "problem", "runs", "steps", "seed", "disturbance", "gamma", "claimed", "confidence", "peak", "closest", "gain",
+    "refuted", "refuted_at", "single", "seconds", "output",
+}  # fmt: skip
+
+
+def test_the_command_says_the_same_as_object_table_and_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gains, worst = case_of("sticky")
+    table = tmp_path / "steps.csv"
+    arguments = ("--runs", 300, "--steps", 90, "--seed", 4, "--disturbance", "worst-case")
+    assert simulate_command(tmp_path, *arguments, "--json", "-o", table, gains=gains) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts.keys() == KEYS
+    assert (facts["refuted"], facts["refuted_at"], facts["disturbance"]) == (False, None, "worst-case")
+    assert facts["gain"] == pytest.approx(worst.gain, rel=0.1)
+    ensemble = simulation.simulate(gains, runs=300, steps=90, seed=4, w=worst.w)
+    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    assert [int(row["step"]) for row in rows] == list(range(90))
+    columns = {"mean_square": "mean", **{name: name for name in ("low", "high", "least", "energy", "bound")}}
+    for column, field in columns.items():
+        assert [float(row[column]) for row in rows] == getattr(ensemble, field).tolist()
+    at = facts["peak"]["step"]
+    assert facts["peak"] == {key: (int if key == "step" else float)(rows[at][key]) for key in facts["peak"]}
+    single = facts["single"]
+    assert single["largest"] == ensemble.peaks.max()
+    assert single["above"] == (ensemble.peaks > gains.certificate.gamma).sum() > 0
+    assert (ensemble.peaks <= single["median"]).mean() >= 0.5
+    assert (ensemble.peaks <= single["p95"]).mean() >= 0.95
+    assert simulate_command(tmp_path, *arguments, gains=gains) == 0
+    text = capsys.readouterr().out
+    assert f"mean |z~|^2 = {facts['peak']['mean_square']:.6g} at step {at}" in text
+    assert f"{single['above']} of 300 runs exceed that; they may" in text
+    assert "not refuted" in text
+
+
+def test_a_gamma_that_is_too_low_is_refuted_with_exit_code_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gains, worst = case_of("sticky")
+    low = claiming(gains, 0.8 * worst.gain)
+    assert simulate_command(tmp_path, "--disturbance", "worst-case", gains=low) == 1
+    assert f"REFUTED    gamma = {0.8 * worst.gain:.6g}: at step " in capsys.readouterr().out
+
+
+def test_what_is_beyond_float64_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)))
+    gains = uncertified(sticky(disturbance={"kind": "impulse"}), K, H, method="none")
+    assert simulate_command(tmp_path, "--steps", 400, "--runs", 20, "--json", gains=gains) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["peak"]["mean_square"] is None
+    assert facts["claimed"] is False
+    assert simulate_command(tmp_path, "--steps", 400, "--runs", 20, gains=gains) == 1
+    assert "which the file does not claim" in capsys.readouterr().out
+
+
+def test_a_problem_without_a_disturbance_has_nothing_to_refute(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate_command(tmp_path, "--runs", 10, "--json", gains=observer_gains(sticky())) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["closest"], facts["gain"], facts["refuted"]) == (None, None, False)
+    assert simulate_command(tmp_path, "--runs", 10, gains=observer_gains(sticky())) == 0
+    assert "without a disturbance gamma allows for no error" in capsys.readouterr().out
+
+
+def test_a_table_is_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "steps.csv"
+    table.write_text("mine")
+    assert simulate_command(tmp_path, "--runs", 10, "-o", table, gains=observer_gains(sticky())) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert table.read_text() == "mine"
+    assert simulate_command(tmp_path, "--runs", 10, "-o", table, "--force", gains=observer_gains(sticky())) == 0
+    assert table.read_text().startswith("step,mean_square,low,high,least,energy,bound\n0,0.0,0.0,")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--runs", "1"], "peakmesh: runs is 1; an interval for the mean takes at least 2\n"),
+        (
+            ["--dask", "nowhere"],
+            "peakmesh: no Dask scheduler answers at nowhere: missing port number in address 'nowhere'\n",
+        ),
+    ],
+)
+def test_bad_usage_is_refused_in_one_sentence(
+    tmp_path: Path, arguments: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate_command(tmp_path, *arguments, gains=observer_gains(sticky())) == 2
+    assert capsys.readouterr().err == sentence
