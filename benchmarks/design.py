@@ -1,10 +1,16 @@
-"""How long a design takes: the paper's LMI as printed beside the decomposed one, and large networks.
+"""What a design costs and what it gives: the tables of docs/theory.md, measured anew.
 
-    python benchmarks/design.py [--literal 4 8 12] [--decomposed 4 8 12 25 50 100 200] [--seed 1]
+    python benchmarks/design.py [--decomposed 4 8 12 25 50 100 200] [--literal 4 8 12] [--exact 4 6 20]
+                                [--networks zhu2020-ideal zhu2020-lossy ring-1 ...] [--seed 1]
 
-Every design runs in a process of its own, so that its peak memory is its own. "solver" is the solver's own part,
-"whole" everything from problem to certified gains, "cpu" the processor time of the whole, which other programs on
-the machine disturb less. The networks are `banded`, with 4 modes and 2 states.
+First the networks `banded`, with 4 modes and 2 states: the paper's LMI as printed beside the decomposed one, large
+networks, and the search for the least exact gain. Every design runs in a process of its own, so that its peak memory
+is its own. "solver" is the solver's own part, "whole" everything from problem to certified gains, "cpu" the processor
+time of the whole, which other programs on the machine disturb less.
+
+Then the ladder of the paper's two examples and of four random networks: Theorem 2's gamma and the exact gain of its
+gains, the exact gain of Kalman-consensus gains, what the search for the least exact gain certifies, and the floor.
+An empty list leaves a part out.
 """
 
 from __future__ import annotations
@@ -13,30 +19,40 @@ import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from agent.contract.problem import Problem
 from designer.problems import find
+from designer.reproduce import PRINTED, Computed
 
 REACH = 2
 CHILD = """
 import json, resource, sys, time
-from benchmarks.design import banded
+from benchmarks.design import network
 from designer.synthesis import design
-problem = banded(int(sys.argv[2]), seed=int(sys.argv[3]))
+problem = network(sys.argv[2], seed=int(sys.argv[3]))
 started, cpu = time.perf_counter(), time.process_time()
 gains = design(problem, method=sys.argv[1])
 whole, cpu = time.perf_counter() - started, time.process_time() - cpu
 proved = gains.certificate
 print(json.dumps({
     "solver": gains.solver.seconds, "whole": whole, "cpu": cpu, "certify": gains.seconds["certify"],
-    "lmi_gamma": proved.lmi_gamma, "gamma": proved.gamma, "form": proved.form, "status": gains.solver.status,
+    "lmi_gamma": proved.lmi_gamma, "gamma": proved.gamma, "exact": proved.exact, "floor": proved.floor,
+    "form": proved.form, "status": gains.solver.status.partition(";")[0],
     "iterations": gains.solver.iterations, "file": len(gains.canonical()) / 1e6,
     "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
 }))
 """
+
+
+def network(name: str, *, seed: int = 1) -> Problem:
+    """A network by its name: "banded-12" has 12 nodes; else one of NETWORKS."""
+    kind, _, number = name.partition("-")
+    return banded(int(number), seed=seed) if kind == "banded" else NETWORKS[name](seed=seed)
 
 
 def banded(n: int, *, seed: int = 1) -> Problem:
@@ -65,19 +81,76 @@ def banded(n: int, *, seed: int = 1) -> Problem:
     return Problem.from_document({**paper, "name": f"banded-{n}", "node": nodes, "topology": topologies})
 
 
-def measure(method: str, n: int, seed: int) -> dict[str, Any]:
+def random_network(
+    number: int, *, seed: int, n: int, nx: int, modes: int, arrival: tuple[float, float], ring: bool = False
+) -> Problem:
+    """A stable random plant with one disturbance, n sensors with a noise of their own each, a random chain.
+
+    A ring hears the node before in every other mode, the node after in the rest; else each link is there with
+    probability one half.
+    """
+    rng = np.random.default_rng([seed, number, n, nx, modes])
+    A = rng.normal(size=(nx, nx))
+    A *= rng.uniform(0.75, 0.9) / np.abs(np.linalg.eigvals(A)).max()
+    transition = rng.uniform(0.1, 1.0, size=(modes, modes))
+    adjacencies = []
+    for s in range(modes):
+        if ring:
+            links = np.roll(np.eye(n), 1 if s % 2 else -1, axis=1)
+        else:
+            links = np.where(rng.uniform(size=(n, n)) < 0.5, 1.0, 0.0)
+        adjacencies.append(np.clip(links + np.eye(n), 0.0, 1.0))
+    noise = rng.uniform(0.3, 0.8, size=n)
+    return Problem.from_document(
+        {
+            "name": "random",
+            "plant": {
+                "A": A.tolist(),
+                "B": np.hstack([rng.normal(size=(nx, 1)), np.zeros((nx, n))]).tolist(),
+                "M": rng.normal(size=(1, nx)).tolist(),
+            },
+            "node": [
+                {
+                    "name": str(i + 1),
+                    "C": [rng.normal(size=nx).tolist()],
+                    "D": [[0.0, *(noise[i] * np.eye(n)[i]).tolist()]],
+                    "arrival_probability": float(rng.uniform(*arrival)),
+                }
+                for i in range(n)
+            ],
+            "topology": [{"name": str(s + 1), "adjacency": a.tolist()} for s, a in enumerate(adjacencies)],
+            "markov": {
+                "transition": (transition / transition.sum(axis=1, keepdims=True)).tolist(),
+                "initial": "1",
+            },
+        }
+    )
+
+
+NETWORKS: dict[str, Callable[..., Problem]] = {
+    "zhu2020-ideal": lambda *, seed: find("zhu2020-ideal"),
+    "zhu2020-lossy": lambda *, seed: find("zhu2020-lossy"),
+    "ring-1": partial(random_network, 1, n=3, nx=2, modes=2, arrival=(0.75, 0.95), ring=True),
+    "ring-2": partial(random_network, 2, n=3, nx=2, modes=2, arrival=(0.75, 0.95), ring=True),
+    "3-states": partial(random_network, 3, n=4, nx=3, modes=3, arrival=(0.75, 0.95)),
+    "heavy-loss": partial(random_network, 4, n=4, nx=2, modes=2, arrival=(0.3, 0.5)),
+}
+
+
+def measure(method: str, name: str, seed: int) -> dict[str, Any]:
     """One design in a process of its own."""
-    child = [sys.executable, "-c", CHILD, method, str(n), str(seed)]
+    child = [sys.executable, "-c", CHILD, method, name, str(seed)]
     done = subprocess.run(child, capture_output=True, text=True, check=False)
     if done.returncode:
-        sys.exit(f"{method}, {n} nodes: {done.stderr.strip().splitlines()[-1]}")
+        sys.exit(f"{method}, {name}: {done.stderr.strip().splitlines()[-1]}")
     return dict(json.loads(done.stdout))
 
 
 def row(method: str, n: int, facts: dict[str, Any]) -> str:
     """One line of the table."""
     numbers = [f"{facts[name]:9.2f}" for name in ("solver", "whole", "cpu", "certify")]
-    sizes = f"{facts['peak']:8.0f} {facts['file']:8.3f} {facts['lmi_gamma']:10.6f} {facts['gamma']:10.6f}"
+    lmi = "-" if facts["lmi_gamma"] is None else f"{facts['lmi_gamma']:.6f}"
+    sizes = f"{facts['peak']:8.0f} {facts['file']:8.3f} {lmi:>10} {facts['gamma']:10.6f}"
     said = f"{facts['form']}; {facts['status']}, {facts['iterations']} iterations"
     return f"{method:<10} {n:5d} {''.join(numbers)} {sizes}  {said}"
 
@@ -100,20 +173,45 @@ def summary(measured: dict[tuple[str, int], dict[str, Any]]) -> list[str]:
     return lines
 
 
+LADDER_HEAD = (
+    f"{'network':<15}{'printed':>8}{'Theorem 2':>11}{'its exact':>11}{'consensus':>11}{'designed':>11}{'floor':>11}"
+    f"{'against T2':>12}{'cpu s T2':>10}{'cpu s designed':>16}"
+)
+
+
+def ladder_row(name: str, seed: int) -> str:
+    """One line of the ladder; Theorem 2 for the reduced state, so that larger networks get their turn."""
+    lmi, best = measure("theorem2-reduced", name, seed), measure("exact", name, seed)
+    consensus = Computed(network(name, seed=seed)).consensus
+    values = [lmi["lmi_gamma"], lmi["exact"] and lmi["exact"][1], consensus, best["gamma"], best["floor"]]
+    cells = "".join(f"{'not stable' if value is None else f'{value:.5f}':>11}" for value in values)
+    gain = 100.0 * (best["gamma"] / lmi["lmi_gamma"] - 1.0)
+    printed = f"{PRINTED[name]:g}" if name in PRINTED else ""
+    return f"{name:<15}{printed:>8}{cells}{gain:>10.1f} %{lmi['cpu']:>10.1f}{best['cpu']:>16.1f}"
+
+
 def main() -> None:
     """Measure and print, line by line."""
-    parser = argparse.ArgumentParser(description="How long a design takes.")
+    parser = argparse.ArgumentParser(description="What a design costs and what it gives.")
     parser.add_argument("--literal", type=int, nargs="*", default=[4, 8, 12], metavar="NODES")
     parser.add_argument("--decomposed", type=int, nargs="*", default=[4, 8, 12, 25, 50, 100, 200], metavar="NODES")
+    parser.add_argument("--exact", type=int, nargs="*", default=[4, 6, 20], metavar="NODES")
+    parser.add_argument("--networks", nargs="*", default=list(NETWORKS), choices=list(NETWORKS), metavar="NAME")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    print(HEAD)
     measured: dict[tuple[str, int], dict[str, Any]] = {}
     plan = [("decomposed", n) for n in options.decomposed] + [("theorem2", n) for n in options.literal]
+    plan += [("exact", n) for n in options.exact]
+    if plan:
+        print(HEAD)
     for method, n in plan:
-        measured[method, n] = measure(method, n, options.seed)
+        measured[method, n] = measure(method, f"banded-{n}", options.seed)
         print(row(method, n, measured[method, n]), flush=True)
     print("\n".join(summary(measured)))
+    if options.networks:
+        print(LADDER_HEAD)
+    for name in options.networks:
+        print(ladder_row(name, options.seed), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """How long the search for the least exact gain takes, estimated before it begins: what the default method depends on.
 
-The search takes about 12 f^0.7 steps for f free entries of the gains, and a step about 0.17 ms m N^1.4 for m modes and
-N entries of the error state. The factors are a fit to measured times of one core (benchmarks/design.py measures them
-anew): within a factor of 3 of what problems from 4 nodes to 30 took, and beyond that an extrapolation.
+The time grows with the free entries of the gains (how many steps the search takes), with the modes and with the size of
+the error state (what a step costs). The factors are a fit to the processor time of one core: 10 and 17 s for the
+paper's examples (210 free entries, 4 modes, 10 states), 27 s for quadruple-tank (1040, 3, 28), 150 s for 20 nodes
+(1362, 4, 42), and for 30 nodes (2130, 4, 62) more than 900 s. Within a factor of 4 of these; beyond an extrapolation.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def seconds_of_exact(problem: Problem) -> float:
     modes, size = len(problem.topologies), (problem.n + 1) * problem.nx
     entries = Entries(problem)
     free = float(np.count_nonzero(entries.K) + np.count_nonzero(entries.H))
-    return float(0.002 * modes * free**0.7 * size**1.4)
+    return float(0.001 * modes * free**0.8 * size**1.5)
 
 
 def in_words(seconds: float) -> str:
