@@ -51,6 +51,20 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "ladder     1.414214  floor\n" in printed
 
 
+def test_what_if(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A network without a part is designed like any other; the price of every part comes as one table."""
+    assert run("design", "two-nodes", "--without-node", "left", "--method", "decomposed", "--json") == 0
+    designed = json.loads(capsys.readouterr().out)
+    assert (designed["problem"], designed["output"]) == ("two-nodes-without-left", "two-nodes-without-left.gains.json")
+    assert Gains.load(Path(designed["output"])).problem.node_names == ("right",)
+    assert run("design", "two-nodes", "--price", "--method", "decomposed", "--json") == 0
+    printed = capsys.readouterr()
+    table = json.loads(printed.out)
+    assert len(table["rows"]) == 4
+    assert next(row["gamma"] for row in table["rows"] if row["name"] == "left") == pytest.approx(designed["gamma"])
+    assert "   5 of 5 designs" in printed.err
+
+
 def test_show_lists_the_built_in_problems(capsys: pytest.CaptureFixture[str]) -> None:
     """Without a file, show names every built-in problem."""
     assert run("show") == 0

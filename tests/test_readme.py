@@ -10,6 +10,7 @@ import pytest
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
+from designer.analysis import analyse, load_given
 from designer.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -40,6 +41,25 @@ def test_its_example_of_a_real_network_is_one() -> None:
     assert (problem.carries_plant, problem.delivery.tolist()) == (False, [[1.0, 1.0], [0.95, 1.0]])
     document["plant"]["A"][0][0] = 1.02
     Problem.from_document(document)
+
+
+def test_its_plain_gains_are_analysed_as_it_says(tmp_path: Path) -> None:
+    """The example of gains in a plain JSON fits the example of a problem; what analyse says of both is in the text."""
+    (gains,) = blocks("json")
+    (tmp_path / "mine.json").write_text(gains)
+    problem = Problem.from_document(tomllib.loads(blocks("toml")[0]))
+    said = analyse(problem, load_given(tmp_path / "mine.json", problem)).text()
+    assert said.replace(str(tmp_path / "mine.json"), "mine.json") in README
+
+
+def test_its_table_has_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """And no other."""
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    known = set(re.findall(r"^    (\w+) ", capsys.readouterr().out, flags=re.MULTILINE))
+    rows = README.partition("| command | does | prints |\n|---|---|---|\n")[2].partition("\n\n")[0].splitlines()
+    table = {name for row in rows for name in re.findall(r"`(\w+)", row.split(" | ")[0])}
+    assert table == known
 
 
 def test_its_sensor_is_the_script() -> None:
