@@ -56,7 +56,7 @@ def test_its_table_has_every_command(capsys: pytest.CaptureFixture[str]) -> None
     """And no other."""
     with pytest.raises(SystemExit):
         main(["--help"])
-    known = set(re.findall(r"^    (\w+) ", capsys.readouterr().out, flags=re.MULTILINE))
+    known = set(re.findall(r"^    (\w+)", capsys.readouterr().out, flags=re.MULTILINE))
     rows = README.partition("| command | does | prints |\n|---|---|---|\n")[2].partition("\n\n")[0].splitlines()
     table = {name for row in rows for name in re.findall(r"`(\w+)", row.split(" | ")[0])}
     assert table == known
