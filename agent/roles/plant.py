@@ -10,7 +10,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, PlantState, decode, measurement
-from agent.contract.problem import Node
+from agent.contract.problem import Node, Problem
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.roles.joining import take_part
 
@@ -18,12 +18,12 @@ from agent.roles.joining import take_part
 def run(bus: Bus, gains: Gains) -> None:
     """Take part as the plant until the run has ended."""
     problem = gains.problem
-    SimulatedPlant(gains, seed=0)  # refuses gains without the disturbance that the problem asks for, before the run
+    SimulatedPlant(problem, seed=0, worst_case=gains.worst_case)  # where a worst case is lacking, say so before the run
     modes = bus.channel(MODE)
     bus.advertise([PLANT_STATE, *map(measurement, problem.node_names)])
 
     def work(start: Control) -> None:
-        plant = SimulatedPlant(gains, seed=start.seed)
+        plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case)
         while True:
             state, measurements = plant.advance(decode(MODE, modes.next().payload).step)
             for name, y in measurements.items():
@@ -37,10 +37,10 @@ def run(bus: Bus, gains: Gains) -> None:
 class SimulatedPlant:
     """x(k) from zero, and what every sensor delivers of it."""
 
-    def __init__(self, gains: Gains, *, seed: int) -> None:
-        self._problem = problem = gains.problem
+    def __init__(self, problem: Problem, *, seed: int, worst_case: Array | None = None) -> None:
+        self._problem = problem
         self._losses = Losses(problem, seed=seed)
-        self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=gains.worst_case)
+        self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=worst_case)
         self._x = np.zeros(problem.nx)
         self._step = 0
 
