@@ -93,6 +93,18 @@ def real_networks(seed: int, **shape: Any) -> dict[str, Problem]:
     }
 
 
+def own_noise(problem: Problem) -> Problem:
+    """The same with one more w for each measurement, which disturbs nothing else."""
+    document, more = problem.document(), sum(len(node.C) for node in problem.nodes)
+    document["plant"]["B"] = np.hstack([problem.plant.B, np.zeros((problem.nx, more))]).tolist()
+    noise = np.eye(more)
+    for node in document["node"]:
+        measurements = len(node["C"])
+        node["D"] = np.hstack([node["D"], noise[:measurements]]).tolist()
+        noise = noise[measurements:]
+    return Problem.from_document(document)
+
+
 def random_gains(problem: Problem, seed: int, *, size: float = 0.3) -> tuple[Array, Array]:
     """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) with the sparsity of (9); unbiased where asked."""
     rng = np.random.default_rng(seed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from networks import random_problem
@@ -78,16 +80,44 @@ def test_an_answer_that_the_check_does_not_confirm_is_refused(bad: str, monkeypa
         "not-a-number": np.full((1, 2, 1, 1), np.nan),
     }
     wrong = LmiSolution(1.0, np.eye(1), Q[bad], np.ones((1, 2, 2)), 3.0 * np.ones((1, 2, 2)), SOLVER)
-    monkeypatch.setitem(synthesis.METHODS, "wrong", lambda problem: wrong)
+    monkeypatch.setitem(synthesis.METHODS, "wrong", lambda problem: iter([wrong]))
     with pytest.raises(Unattainable, match=r"made up says optimal_inaccurate .*does not confirm.*; try"):
         design(find("two-nodes"), method="wrong")
 
 
 def test_an_inaccurate_answer_is_backed_off_until_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     """A P that is a little too large for (17) is lowered, gamma rises by as much, and what is stored holds."""
-    exact = METHODS["theorem2-reduced"](find("two-nodes"))
+    exact = next(METHODS["theorem2-reduced"](find("two-nodes")))
     rough = exact._replace(R=1.00001 * exact.R, Q=1.00001 * exact.Q, X=1.00001 * exact.X, Y=1.00001 * exact.Y)
-    monkeypatch.setitem(synthesis.METHODS, "rough", lambda problem: rough)
+    monkeypatch.setitem(synthesis.METHODS, "rough", lambda problem: iter([rough]))
     gains = design(find("two-nodes"), method="rough")
     assert verify(gains).holds
     assert np.sqrt(2.0) < gains.certificate.gamma < np.sqrt(2.0) * (1.0 + 1e-4)
+
+
+def test_an_answer_that_is_confirmed_near_its_gamma_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the solver calls it: optimal_inaccurate is good enough where the check says so."""
+    good = next(METHODS["theorem2-reduced"](find("two-nodes")))
+    called_bad = good._replace(solver=good.solver.model_copy(update={"status": "optimal_inaccurate"}))
+
+    def made(problem: Problem) -> Iterator[LmiSolution]:
+        yield called_bad
+        raise AssertionError("nobody should have asked for more")
+
+    monkeypatch.setitem(synthesis.METHODS, "made", made)
+    gains = design(find("two-nodes"), method="made")
+    assert gains.solver.status == "optimal_inaccurate"
+    assert verify(gains).holds
+
+
+def test_the_best_confirmed_answer_is_kept_where_none_is_near_its_gamma(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers that are refused, or confirmed far above the LMI's gamma, lead to the next; what was tried is said."""
+    good = next(METHODS["theorem2-reduced"](find("two-nodes")))
+    record = SOLVER.model_copy(update={"status": "optimal"})
+    refused = good._replace(Y=3.0 * good.Y, solver=SOLVER)
+    claims = [good._replace(gamma=share * good.gamma, solver=record) for share in (0.9, 0.8)]
+    monkeypatch.setitem(synthesis.METHODS, "made", lambda problem: iter([refused, *claims]))
+    gains = design(find("two-nodes"), method="made")
+    assert gains.certificate.lmi_gamma == claims[0].gamma
+    assert gains.solver.status == "optimal; tried further: made up optimal"
+    assert gains.certificate.gamma == pytest.approx(np.sqrt(2.0), rel=1e-4)

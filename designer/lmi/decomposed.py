@@ -17,44 +17,64 @@ and R >= 0 once. Where the gains have to be unbiased, Y_ii stands for Q_bar_i A 
 no x; and where no loss is hidden from its node either, x and R are left out of it all.
 
 The balance is large and sparse: it is split along a tree of cliques into pieces that exchange what they share. In
-each piece one node needs no S_i: what is left of the piece serves. docs/decomposed.md derives it all.
+each piece one node needs no S_i: what is left of the piece serves. An entry of w that disturbs one sensor alone goes
+with the error of that node. docs/decomposed.md derives it all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import Unattainable
 from agent.contract.gains import Solver
 from agent.contract.problem import Node, Problem
 from designer.error_model import measurement_slices
-from designer.lmi import LmiSolution, conic
+from designer.lmi import LmiSolution, attempts, conic
+from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.cliques import clique_tree
 from designer.lmi.cones import Assembly, Cones, Indices, Inequality
 from designer.lmi.units import Units, natural_units, rescaled, spectral_radius
 
 Link = tuple[int, int]  # (i, j): node i hears node j
 MARGIN = 1e-6  # of the balance, for unstable plants: designer.inwards knows no way inwards there
-_ADVICE = "try the problem in other units, so that its numbers are near 1"
+
+
+class Columns(NamedTuple):
+    """Which entries of w disturb one sensor alone, and not the plant; and the others."""
+
+    shared: Indices
+    own: list[Indices]  # of each node
+
+    def of(self, j: int) -> Indices:
+        """Those that may disturb node j: shared ones first."""
+        return np.concatenate([self.shared, self.own[j]])
 
 
 class Piece(NamedTuple):
-    """A part of the balance of one mode, over (x, w) and the errors of a few nodes."""
+    """A part of the balance of one mode, over (x, shared w) and the errors of a few nodes, each with its own w."""
 
     matrix: Inequality
-    at: dict[int, Indices]  # the rows of (x, w) under 0, those of e_i under i + 1
+    at: dict[int, Indices]  # the rows of (x, shared w) under 0, those of (e_i, own w) under i + 1
 
     def rows(self, vertices: tuple[int, ...]) -> Indices:
         return np.concatenate([self.at[v] for v in vertices])
 
+    def x(self, columns: Columns) -> Indices:
+        return self.at[0][: len(self.at[0]) - len(columns.shared)]
+
+    def w(self, columns: Columns, j: int) -> Indices:
+        """The rows of the w that may disturb node j, in the order of `Columns.of`."""
+        shared, own = len(columns.shared), len(columns.own[j])
+        return np.concatenate([self.at[0][len(self.at[0]) - shared :], self.at[j + 1][len(self.at[j + 1]) - own :]])
+
 
 class NodePart(NamedTuple):
-    """The inequality of node i: the rows of (x, w, e_N), those of Q_bar_i, and S_i where it has one."""
+    """The inequality of node i: the rows of (x, w, e_N), in the order of a piece, of Q_bar_i, and S_i, if any."""
 
     matrix: Inequality
     rows: Indices
@@ -80,6 +100,7 @@ class Mode(NamedTuple):
 class Lmi(NamedTuple):
     """The whole problem: minimise delta, over all modes."""
 
+    columns: Columns
     delta: Indices
     R: Indices  # (nx, nx); (0, 0) where x is left out
     modes: list[Mode]
@@ -87,51 +108,37 @@ class Lmi(NamedTuple):
 
 
 def solve(problem: Problem) -> LmiSolution:
-    """Minimise gamma^2 = delta. Clarabel first; then Clarabel on rescaled data, then SCS where it is installed.
+    """Minimise gamma^2 = delta: the first of `answers` that its solver calls accurate. Raises Unattainable."""
+    return first_accurate(answers(problem))
 
-    What failed on the way, or stalled with an inaccurate answer, stands in `solver.status`. Raises Unattainable:
-    infeasible, or no solver had an answer.
+
+def answers(problem: Problem) -> Iterator[LmiSolution]:
+    """What Clarabel says in natural units, then in the problem's own; then SCS, where Clarabel says nothing at all.
+
+    Natural units first: they take fewer steps, and where a state is measured in thousands Clarabel needs them.
     """
-    attempts: list[tuple[Callable[[Cones, Array], conic.Answer], str]] = [
-        (conic.clarabel, ""),
-        (conic.clarabel, " on rescaled data"),
-        (conic.scs, " on rescaled data"),
-    ]
+    natural, own = natural_units(problem), Units(np.ones(problem.nx), 1.0)
+    plan = [Attempt("", partial(_run, problem, conic.clarabel, natural))]
+    plan.append(Attempt(" in the problem's own units", partial(_run, problem, conic.clarabel, own)))
+    if conic.installed(conic.scs):
+        plan.append(Attempt("", partial(_run, problem, conic.scs, natural), last_resort=True))
+    return attempts.answers(f"the decomposed LMI for {problem.name}", plan)
+
+
+def _run(
+    problem: Problem, solver: Callable[[Cones, Array], conic.Answer], units: Units
+) -> tuple[Solver, LmiSolution | None]:
     margin = 0.0 if spectral_radius(problem) < 1.0 else MARGIN
-    failures: list[str] = []
-    inaccurate: LmiSolution | None = None  # the answer of a solver that stalled, for want of a better one
-    for solver, remark in attempts:
-        if not conic.installed(solver) or (inaccurate is not None and solver is conic.scs):
-            continue
-        units = natural_units(problem) if remark else Units(np.ones(problem.nx), 1.0)
-        lmi = assemble(rescaled(problem, units), margin=margin)
-        q = np.zeros(lmi.cones.A.shape[1])
-        q[lmi.delta] = 1.0
-        u, record = solver(lmi.cones, q)
-        if record.status in conic.INFEASIBLE and inaccurate is None:
-            raise Unattainable(
-                f"the decomposed LMI of Theorem 2 is infeasible for {problem.name}, says {record.name}{remark}; it "
-                "has a solution for every plant with all eigenvalues of A well inside the unit circle: "
-                f"check A, or {_ADVICE}"
-            )
-        if record.status in conic.SOLVED:
-            status = "; ".join([record.status + remark, *failures])
-            solution = _solution(problem, lmi, u, units, record.model_copy(update={"status": status}))
-            if record.status == "optimal" or (remark and inaccurate is None):
-                return solution
-            inaccurate = inaccurate or solution
-        failures.append(f"{record.name}{remark} {record.status}")
-    if inaccurate is not None:
-        status = "; ".join([inaccurate.solver.status, *failures[1:]])
-        return inaccurate._replace(solver=inaccurate.solver.model_copy(update={"status": status}))
-    raise Unattainable(
-        f"no solver answered the decomposed LMI of Theorem 2 for {problem.name} ({'; '.join(failures)}); {_ADVICE}"
-    )
+    lmi = assemble(rescaled(problem, units), margin=margin)
+    q = np.zeros(lmi.cones.A.shape[1])
+    q[lmi.delta] = 1.0
+    u, record = solver(lmi.cones, q)
+    return record, _solution(problem, lmi, u, units, record) if record.status in SOLVED else None
 
 
 def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
     """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance."""
-    build, nx, n = Assembly(), problem.nx, problem.n
+    build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
     delta, R = build.unknown(1, 1), build.symmetric(nx if problem.carries_plant else 0)
     if problem.carries_plant:
         positive = build.inequality()  # R >= 0: the balance implies it for stable plants only
@@ -144,38 +151,54 @@ def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
         links = [(i, j) for i in range(n) for j in heard[i]]
         X = {(i, j): build.unknown(nx, len(problem.nodes[j].C)) for i, j in links}
         Y = {(i, j): build.unknown(nx, nx) for i, j in links if i != j or not problem.unbiased}
-        balance = _balance(build, problem, R, Q[s], heard, 1.0 - margin)
+        balance = _balance(build, problem, columns, R, Q[s], heard, 1.0 - margin)
         home = [_home(balance, heard_i) for heard_i in heard]
         spared = {k: max((i for i in range(n) if home[i] == k), key=lambda i: len(heard[i])) for k in set(home)}
         mode = Mode(Q[s], X, Y, T={}, U={}, balance=balance, nodes=[], losses={}, links={}, peaks=[])
         for i in range(n):
             Q_bar = [(float(weight), Q[t][i]) for t, weight in enumerate(weights) if weight > 0.0]
             piece = balance[home[i]]
-            mode.nodes.append(_node(build, problem, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i))
+            mode.nodes.append(_node(build, problem, columns, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i))
             for j in heard[i]:
                 if problem.beta[j] < 1.0:
-                    _loss(build, problem, mode, (i, j), Q_bar, piece)
+                    _loss(build, problem, columns, mode, (i, j), Q_bar, piece)
                 if problem.delivery[i, j] < 1.0:
-                    _link(build, problem, mode, (i, j), Q_bar, piece)
+                    _link(build, problem, columns, mode, (i, j), Q_bar, piece)
             mode.peaks.append(_peak(build, problem, Q[s][i], delta))
         modes.append(mode)
-    return Lmi(delta, R, modes, build.cones())
+    return Lmi(columns, delta, R, modes, build.cones())
+
+
+def split_columns(problem: Problem) -> Columns:
+    """A sensor's own noise meets nobody but those who hear the sensor: it goes where the sensor's error goes."""
+    disturbs = np.array([problem.plant.B.any(axis=0), *(node.D.any(axis=0) for node in problem.nodes)])
+    alone = ~disturbs[0] & (disturbs.sum(axis=0) == 1)
+    return Columns(np.flatnonzero(~alone), [np.flatnonzero(alone & disturbs[j + 1]) for j in range(problem.n)])
 
 
 def _balance(
-    build: Assembly, problem: Problem, R: Indices, Q: list[Indices], heard: list[tuple[int, ...]], kept: float
+    build: Assembly,
+    problem: Problem,
+    columns: Columns,
+    R: Indices,
+    Q: list[Indices],
+    heard: list[tuple[int, ...]],
+    kept: float,
 ) -> list[Piece]:
-    """kept diag{R, I, Q(s)} - [A B]'R[A B] in pieces, one for each clique; all of them have (x, w)."""
-    nx, nw, p = problem.nx, problem.nw, len(R)
+    """kept diag{R, I, Q(s)} - [A B]'R[A B] in pieces, one for each clique; all of them have (x, shared w)."""
+    nx, p = problem.nx, len(R)
+    sizes = [p + len(columns.shared), *(nx + len(own) for own in columns.own)]
     tree = clique_tree([j + 1 for j in heard_i] for heard_i in heard)
     pieces = []
     for clique in tree:
         matrix = build.inequality()
-        pieces.append(Piece(matrix, {v: matrix.append(nx if v else p + nw) for v in clique.vertices}))
+        pieces.append(Piece(matrix, {v: matrix.append(sizes[v]) for v in clique.vertices}))
     placed: set[int] = set()
     for piece, clique in zip(pieces, tree, strict=True):
         for v in set(clique.vertices) - placed - {0}:
-            piece.matrix.add(piece.at[v], piece.at[v], Q[v - 1], factor=kept)
+            e, w = np.split(piece.at[v], [nx])
+            piece.matrix.add(e, e, Q[v - 1], factor=kept)
+            piece.matrix.add_number(w, w, kept * np.eye(len(w)))
         placed |= set(clique.vertices)
         if clique.above is not None:
             U, above = build.symmetric(len(piece.rows(clique.shared))), pieces[clique.above]
@@ -183,9 +206,9 @@ def _balance(
             above.matrix.add(above.rows(clique.shared), above.rows(clique.shared), U)
     first = pieces[0]
     x, w = np.split(first.at[0], [p])
-    first.matrix.add_number(w, w, kept * np.eye(nw))
+    first.matrix.add_number(w, w, kept * np.eye(len(w)))
     if p:
-        A_B = np.hstack([problem.plant.A, problem.plant.B])
+        A_B = np.hstack([problem.plant.A, problem.plant.B[:, columns.shared]])
         first.matrix.add(x, x, R, factor=kept)
         first.matrix.add(first.at[0], first.at[0], R, factor=-1.0, left=A_B.T, right=A_B)
     return pieces
@@ -200,6 +223,7 @@ def _home(balance: list[Piece], heard: tuple[int, ...]) -> int:
 def _node(
     build: Assembly,
     problem: Problem,
+    columns: Columns,
     mode: Mode,
     i: int,
     heard: tuple[int, ...],
@@ -208,9 +232,9 @@ def _node(
     spared: bool,
 ) -> NodePart:
     """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there."""
-    nx, nw, plant, rho = problem.nx, problem.nw, problem.plant, problem.delivery
+    nx, plant, rho, shared = problem.nx, problem.plant, problem.delivery, len(columns.shared)
     if problem.unbiased:
-        piece = Piece(piece.matrix, {**piece.at, 0: piece.at[0][-nw:]})  # x is not in G_i
+        piece = Piece(piece.matrix, {**piece.at, 0: piece.at[0][len(piece.at[0]) - shared :]})  # x is not in G_i
     vertices = (0, *(j + 1 for j in heard))
     S: Indices | None = None
     part = piece
@@ -221,14 +245,14 @@ def _node(
         matrix.add(part.rows(vertices), part.rows(vertices), S)
         piece.matrix.add(piece.rows(vertices), piece.rows(vertices), S, factor=-1.0)
     matrix, last = part.matrix, part.matrix.append(nx)
-    x, w, e_i = part.at[0][:-nw], part.at[0][-nw:], part.at[i + 1]
+    x, w, e_i = part.x(columns), part.at[0][len(part.at[0]) - shared :], part.at[i + 1][:nx]
     for weight, Q_i in Q_bar:
         matrix.add(e_i if problem.unbiased else x, last, Q_i, factor=weight, left=plant.A.T)
-        matrix.add(w, last, Q_i, factor=weight, left=plant.B.T)
+        matrix.add(w, last, Q_i, factor=weight, left=plant.B.T[columns.shared])
         matrix.add(last, last, Q_i, factor=weight)
     for j in heard:
-        node, X, e_j, rho_ij = problem.nodes[j], mode.X[i, j].T, part.at[j + 1], float(rho[i, j])
-        matrix.add(w, last, X, factor=-rho_ij, left=_mean_D(node).T)
+        node, X, e_j, rho_ij = problem.nodes[j], mode.X[i, j].T, part.at[j + 1][:nx], float(rho[i, j])
+        matrix.add(part.w(columns, j), last, X, factor=-rho_ij, left=_mean_D(node).T[columns.of(j)])
         matrix.add(e_j, last, X, factor=-rho_ij * node.arrival_probability, left=node.C.T)
         if (i, j) not in mode.Y:
             continue
@@ -244,10 +268,17 @@ def _node(
 
 
 def _loss(
-    build: Assembly, problem: Problem, mode: Mode, link: Link, Q_bar: list[tuple[float, Indices]], piece: Piece
+    build: Assembly,
+    problem: Problem,
+    columns: Columns,
+    mode: Mode,
+    link: Link,
+    Q_bar: list[tuple[float, Indices]],
+    piece: Piece,
 ) -> None:
     """[T_ij, X_ij'; X_ij, Q_bar_i] >= 0, and -alpha_j rho_ij r_j'T_ij r_j in the balance."""
-    node, matrix, nw = problem.nodes[link[1]], build.inequality(), problem.nw
+    j, matrix = link[1], build.inequality()
+    node = problem.nodes[j]
     beta, C = node.arrival_probability, node.C
     T = build.symmetric(len(C))
     y, last = matrix.append(len(C)), matrix.append(problem.nx)
@@ -255,18 +286,26 @@ def _loss(
     matrix.add(y, last, mode.X[link].T)
     for weight, Q_i in Q_bar:
         matrix.add(last, last, Q_i, factor=weight)
-    x, w = piece.at[0][:-nw], piece.at[0][-nw:]
-    rows, r = (np.concatenate([w, piece.at[link[1] + 1]]), np.hstack([node.D, C])) if node.seen else (x, C)
+    rows, r = piece.x(columns), C
+    if node.seen:
+        rows = np.concatenate([piece.w(columns, j), piece.at[j + 1][: problem.nx]])
+        r = np.hstack([node.D[:, columns.of(j)], C])
     factor = -beta * (1.0 - beta) * float(problem.delivery[link])
     piece.matrix.add(rows, rows, T, factor=factor, left=r.T, right=r)
     mode.T[link], mode.losses[link] = T, matrix
 
 
 def _link(
-    build: Assembly, problem: Problem, mode: Mode, link: Link, Q_bar: list[tuple[float, Indices]], piece: Piece
+    build: Assembly,
+    problem: Problem,
+    columns: Columns,
+    mode: Mode,
+    link: Link,
+    Q_bar: list[tuple[float, Indices]],
+    piece: Piece,
 ) -> None:
     """[U_ij, V_ij'; V_ij, Q_bar_i] >= 0, and -rho_ij (1 - rho_ij) U_ij in the balance."""
-    (i, j), matrix, nx, nw = link, build.inequality(), problem.nx, problem.nw
+    (i, j), matrix, nx, nw = link, build.inequality(), problem.nx, len(columns.of(link[1]))
     node, rho, X, Y = problem.nodes[j], float(problem.delivery[link]), mode.X[link].T, mode.Y[link].T
     U = build.symmetric(2 * nx + nw)
     e_i, e_j, w, last = (matrix.append(size) for size in (nx, nx, nw, nx))
@@ -275,10 +314,10 @@ def _link(
     matrix.add(e_i, last, Y, factor=-1.0)
     matrix.add(e_j, last, Y)
     matrix.add(e_j, last, X, factor=-node.arrival_probability, left=node.C.T)
-    matrix.add(w, last, X, factor=-1.0, left=_mean_D(node).T)
+    matrix.add(w, last, X, factor=-1.0, left=_mean_D(node).T[columns.of(j)])
     for weight, Q_i in Q_bar:
         matrix.add(last, last, Q_i, factor=weight)
-    rows = np.concatenate([piece.at[i + 1], piece.at[j + 1], piece.at[0][-nw:]])
+    rows = np.concatenate([piece.at[i + 1][:nx], piece.at[j + 1][:nx], piece.w(columns, j)])
     piece.matrix.add(rows, rows, U, factor=-rho * (1.0 - rho))
     mode.U[link], mode.links[link] = U, matrix
 

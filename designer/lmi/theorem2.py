@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -19,18 +20,19 @@ import cvxpy as cp
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError, Unattainable
+from agent.contract.errors import InputError
 from agent.contract.gains import Solver
 from agent.contract.problem import Problem
 from designer.error_model import Stacks, stacks
-from designer.lmi import LmiSolution, beyond_paper
+from designer.lmi import LmiSolution, attempts, beyond_paper
+from designer.lmi.attempts import SOLVED, Attempt, first_accurate
+from designer.lmi.conic import failure
 from designer.lmi.units import Units, natural_units, rescaled
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     cp.CLARABEL: {"chordal_decomposition_merge_method": "none"},  # three times faster than merging on six nodes
     cp.SCS: {"eps": 1e-7, "max_iters": 50_000},
 }
-_ADVICE = "try the problem in other units, so that its numbers are near 1"
 
 
 class Lmi(NamedTuple):
@@ -45,44 +47,36 @@ class Lmi(NamedTuple):
 
 
 def solve(problem: Problem, *, reduced: bool = False) -> LmiSolution:
-    """Minimise gamma^2 subject to (36) and (37) for every mode.
+    """Minimise gamma^2 subject to (36) and (37) for every mode: the first of `answers` that is called accurate.
 
-    Clarabel first; if it gives no answer, Clarabel on rescaled data, then SCS where it is installed. What
-    failed on the way stands in `solver.status`. Raises Unattainable: infeasible, or no solver had an answer;
-    InputError: the problem has a part that is not in the paper.
+    Raises Unattainable: infeasible, or no solver had an answer; InputError: a part of it is not in the paper.
     """
+    return first_accurate(answers(problem, reduced=reduced))
+
+
+def answers(problem: Problem, *, reduced: bool = False) -> Iterator[LmiSolution]:
+    """What Clarabel says, then on rescaled data; then SCS, where Clarabel says nothing at all."""
     part = beyond_paper(problem)
     if part is not None:
         raise InputError(
             f"Theorem 2 is the paper's, and the paper does not know that {part}, as it is in {problem.name}; "
             "use --method decomposed, or --method exact"
         )
-    attempts = [(cp.CLARABEL, ""), (cp.CLARABEL, " on rescaled data"), (cp.SCS, " on rescaled data")]
-    failures: list[str] = []
-    for solver, remark in attempts:
-        if solver not in cp.installed_solvers():
-            continue
-        units = natural_units(problem) if remark else Units(np.ones(problem.nx), 1.0)
-        lmi = theorem2(rescaled(problem, units), reduced=reduced)
-        status, seconds = _run(lmi.problem, solver)
-        if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE):
-            raise Unattainable(
-                f"the LMI (36)(37) of Theorem 2 is infeasible for {problem.name}, says {solver}{remark}; it has a "
-                f"solution for every plant with all eigenvalues of A well inside the unit circle: check A, or {_ADVICE}"
-            )
-        if status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-            record = Solver(
-                name=solver,
-                version=version(solver.lower()),
-                status="; ".join([status + remark, *failures]),
-                iterations=int(lmi.problem.solver_stats.num_iters or 0),
-                seconds=seconds,
-            )
-            return _solution(lmi, units, record, reduced=reduced)
-        failures.append(f"{solver}{remark} {status}")
-    raise Unattainable(
-        f"no solver answered the LMI (36)(37) of Theorem 2 for {problem.name} ({'; '.join(failures)}); {_ADVICE}"
-    )
+    own, natural = Units(np.ones(problem.nx), 1.0), natural_units(problem)
+    plan = [
+        Attempt("", partial(_attempt, problem, cp.CLARABEL, own, reduced)),
+        Attempt(" on rescaled data", partial(_attempt, problem, cp.CLARABEL, natural, reduced)),
+    ]
+    if cp.SCS in cp.installed_solvers():
+        run = partial(_attempt, problem, cp.SCS, natural, reduced)
+        plan.append(Attempt(" on rescaled data", run, last_resort=True))
+    return attempts.answers(f"the LMI (36)(37) of Theorem 2 for {problem.name}", plan)
+
+
+def _attempt(problem: Problem, solver: str, units: Units, reduced: bool) -> tuple[Solver, LmiSolution | None]:
+    lmi = theorem2(rescaled(problem, units), reduced=reduced)
+    record = _run(lmi.problem, solver)
+    return record, _solution(lmi, units, record, reduced=reduced) if record.status in SOLVED else None
 
 
 class Said(NamedTuple):
@@ -101,11 +95,11 @@ def said_by(solver: str, problem: Problem, *, iterations: int) -> Said:
     units = natural_units(problem)
     lmi = theorem2(rescaled(problem, units))
     limit = {"max_iters": iterations} if solver == cp.SCS else {"max_iter": iterations}
-    status, seconds = _run(lmi.problem, solver, limit)
-    if status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        return Said(None, status, 0, seconds)
+    record = _run(lmi.problem, solver, limit)
+    if record.status not in SOLVED:
+        return Said(None, record.status, 0, record.seconds)
     gamma = units.output * math.sqrt(max(float(lmi.delta.value), 0.0))
-    return Said(gamma, status, int(lmi.problem.solver_stats.num_iters or 0), seconds)
+    return Said(gamma, record.status, record.iterations, record.seconds)
 
 
 def theorem2(problem: Problem, *, reduced: bool = False) -> Lmi:
@@ -216,17 +210,38 @@ def _sparse(problem: Problem, s: int, widths: Sequence[int]) -> Any:
     return cp.bmat(rows)
 
 
-def _run(problem: cp.Problem, solver: str, options: dict[str, Any] | None = None) -> tuple[str, float]:
-    """Solve; the status, or the solver's own words where it raised, and the seconds it took."""
-    start = time.perf_counter()
+def _run(problem: cp.Problem, solver: str, options: dict[str, Any] | None = None) -> Solver:
+    """Solve, and record what the solver says; or its own words where it raised."""
+    options = _OPTIONS[solver] | (options or {})
+    start, iterations, residuals = time.perf_counter(), 0, (math.nan, math.nan)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what cvxpy warns of is the status, and the status is returned
+        warnings.simplefilter("ignore")  # what cvxpy warns of is the status, and the status is recorded
         try:
-            problem.solve(solver=solver, **(_OPTIONS[solver] | (options or {})))
+            data, chain, inverse = problem.get_problem_data(solver, solver_opts=options)
+            found = chain.solve_via_data(problem, data, solver_opts=options)
+            iterations, residuals = _quality(solver, found)
+            problem.unpack_results(found, chain, inverse)
             status = str(problem.status)
-        except (cp.SolverError, ValueError, ArithmeticError) as error:
-            status = f"failed: {str(error).splitlines()[0]}"
-    return status, time.perf_counter() - start
+        except (TypeError, AttributeError):
+            raise  # nothing that a solver says: cvxpy is not what it was
+        except BaseException as error:
+            status = failure(error)
+    return Solver(
+        name=solver,
+        version=version(solver.lower()),
+        status=status,
+        iterations=iterations,
+        residuals=residuals if np.isfinite(residuals).all() else None,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _quality(solver: str, found: Any) -> tuple[int, tuple[float, float]]:
+    """Iterations, and the primal and dual residual, from what the solver returned to cvxpy."""
+    if solver == cp.CLARABEL:
+        return int(found.iterations), (float(found.r_prim), float(found.r_dual))
+    info = found["info"]
+    return int(info["iter"]), (float(info["res_pri"]), float(info["res_dual"]))
 
 
 def _solution(lmi: Lmi, units: Units, solver: Solver, *, reduced: bool) -> LmiSolution:

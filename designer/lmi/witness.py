@@ -21,7 +21,7 @@ class WitnessMode(NamedTuple):
     Q: list[Any]  # Q_i, (nx, nx)
     X: dict[Link, Any]  # (nx, ny_j)
     Y: dict[Link, Any]  # (nx, nx)
-    S: list[Any]  # over (x, w, e_N); over (w, e_N) where the gains have to be unbiased
+    S: list[Any]  # over (x, w, e_N), less what G_i never has; each node's own w stands after its e_j
     T: dict[Link, Any]  # (ny_j, ny_j), where alpha_j > 0
     U: dict[Link, Any]  # over (e_i, e_j, w), where rho_ij < 1
     nodes: list[Any]
@@ -75,6 +75,8 @@ def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> W
     rows = np.eye(p + nw + n * nx)  # row k picks entry k of (x, w, e)
     x, w = rows[:p], rows[p : p + nw]
     e = [rows[p + nw + i * nx :][:nx] for i in range(n)]
+    own = [[k for k in range(nw) if _only(problem, k, j)] for j in range(n)]
+    shared = [k for k in range(nw) if not any(k in own_j for own_j in own)]
     balance = w.T @ w
     if p:
         A_B = plant.A @ x + plant.B @ w
@@ -82,15 +84,17 @@ def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> W
 
     nodes, S = [], []
     for i in range(n):
-        G = {"w": Q_bar[i] @ plant.B - sum(rho[i, j] * X[i, j] @ Dm[j] for j in N[i])}
-        if not problem.unbiased:
-            G = {"x": Q_bar[i] @ plant.A - sum(all_Y[i, j] for j in N[i]), **G}
+        G_x = Q_bar[i] @ plant.A - sum(all_Y[i, j] for j in N[i])
+        G_w = Q_bar[i] @ plant.B - sum(rho[i, j] * X[i, j] @ Dm[j] for j in N[i])
+        picks, parts = ([], []) if problem.unbiased else ([x], [G_x])
+        picks, parts = [*picks, w[shared]], [*parts, G_w[:, shared]]
         for j in N[i]:
-            on_e_j = rho[i, j] * (all_Y[i, j] - beta[j] * X[i, j] @ C[j])
-            own = sum((1.0 - rho[i, k]) * all_Y[i, k] for k in N[i]) if j == i else 0.0
-            G[f"e_{j}"] = on_e_j + own
-        picks = {"x": x, "w": w, **{f"e_{j}": e[j] for j in N[i]}}
-        embed, G_i = np.vstack([picks[name] for name in G]), cp.hstack(list(G.values()))
+            G_j = rho[i, j] * (all_Y[i, j] - beta[j] * X[i, j] @ C[j])
+            if j == i:
+                G_j = G_j + sum((1.0 - rho[i, k]) * all_Y[i, k] for k in N[i])
+            picks, parts = [*picks, e[j], w[own[j]]], [*parts, G_j, G_w[:, own[j]]]
+        embed = np.vstack(picks)
+        G_i = cp.hstack([part for pick, part in zip(picks, parts, strict=True) if len(pick)])
         S.append(_symmetric(len(embed)))
         nodes.append(cp.bmat([[S[i], G_i.T], [G_i, Q_bar[i]]]))
         balance = balance + e[i].T @ Q[s][i] @ e[i] - embed.T @ S[i] @ embed
@@ -103,15 +107,23 @@ def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> W
             r_j = C[j] @ e[j] + D[j] @ w if problem.nodes[j].seen else C[j] @ x
             balance = balance - beta[j] * (1.0 - beta[j]) * rho[i, j] * r_j.T @ T[i, j] @ r_j
         if rho[i, j] < 1.0:
-            U[i, j] = _symmetric(2 * nx + nw)
-            V_ij = cp.hstack([-Y[i, j], Y[i, j] - beta[j] * X[i, j] @ C[j], -X[i, j] @ Dm[j]])
+            at_j = [*shared, *own[j]]
+            U[i, j] = _symmetric(2 * nx + len(at_j))
+            V_ij = cp.hstack([-Y[i, j], Y[i, j] - beta[j] * X[i, j] @ C[j], -X[i, j] @ Dm[j][:, at_j]])
             link_matrices[i, j] = cp.bmat([[U[i, j], V_ij.T], [V_ij, Q_bar[i]]])
-            embed = np.vstack([e[i], e[j], w])
+            embed = np.vstack([e[i], e[j], w[at_j]])
             balance = balance - rho[i, j] * (1.0 - rho[i, j]) * embed.T @ U[i, j] @ embed
 
     M, nz = plant.M, problem.nz
     peaks = [cp.bmat([[Q_i, M.T], [M, delta * np.eye(nz)]]) for Q_i in Q[s]]
     return WitnessMode(Q[s], X, Y, S, T, U, nodes, losses, link_matrices, balance, peaks)
+
+
+def _only(problem: Problem, k: int, j: int) -> bool:
+    """Whether entry k of w disturbs node j, and neither the plant nor another node."""
+    others = [node.D for i, node in enumerate(problem.nodes) if i != j]
+    elsewhere = any(bool(matrix[:, k].any()) for matrix in (problem.plant.B, *others))
+    return bool(problem.nodes[j].D[:, k].any()) and not elsewhere
 
 
 def _symmetric(order: int) -> Any:
