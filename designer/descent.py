@@ -128,18 +128,30 @@ class _Search:
             self.ends.append(coarse[name].x[:-1])
             self.found[name] = math.exp(coarse[name].x[-1] / 2.0)
         name = min(self.found, key=lambda start: self.found[start])
-        point = self._follow(name, _FINE, coarse[name].x, coarse[name].inverse_hessian)
+        point = self._lengthen(name, _COARSE[-1:], coarse[name])
+        point = self._follow(name, _FINE, point.x, point.inverse_hessian)
+        point = self._lengthen(name, _FINE, point)
+        if self._gain(point.x).stable:
+            self._centre(point)
+
+    def _lengthen(self, name: str, weights: tuple[float, ...], point: bfgs.Point) -> bfgs.Point:
+        """Double T, and follow again, while T is too short for the gains in hand; the point on the last T."""
         gain, radius = self._gain(point.x), math.inf
         while self._horizon_is_short(gain, point.x) and (gain.stable or gain.radius < radius * _SLOWER):
             radius = gain.radius
             self.barrier, self.best = Barrier(self.problem, 2 * self.barrier.horizon), None
-            point = self._follow(name, _FINE, self._begin(self.barrier.entries.unpack(point.x[:-1])))
+            point = self._follow(name, weights, self._begin(self.barrier.entries.unpack(point.x[:-1])))
             gain = self._gain(point.x)
-        if gain.stable:
-            self._centre(point)
+        return point
 
     def _gain(self, x: Array) -> Gain:
         return exact_gain(error_model(self.problem, *self.barrier.entries.unpack(x[:-1])))
+
+    def _horizon_is_short(self, gain: Gain, x: Array) -> bool:
+        if 2 * self.barrier.horizon > _LONGEST:
+            return False
+        _, g = horizon_gain(self.barrier.operator(x[:-1]), self.barrier.horizon)
+        return gain.high > math.sqrt(g) * (1.0 + _SHORT)
 
     def _begin(self, gains: StackedGains) -> Array:
         """[v; y] with g 10 % above gamma_T^2."""
@@ -163,9 +175,6 @@ class _Search:
             point = self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
             x, inverse_hessian = point.x, point.inverse_hessian
         return point
-
-    def _horizon_is_short(self, gain: Gain, x: Array) -> bool:
-        return 2 * self.barrier.horizon <= _LONGEST and gain.high > math.exp(x[-1] / 2.0) * (1.0 + _SHORT)
 
     def _centre(self, point: bfgs.Point) -> None:
         """From the least gamma to smaller and faster gains, gamma held below _SLACK times the least."""

@@ -13,13 +13,15 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.certificate import verify
+from designer.consensus import least_variance_gains
+from designer.error_model import error_model, step
 from designer.problems import find, names
 from designer.synthesis import design
 
 
 def test_every_built_in_problem_loads_under_its_own_name() -> None:
     """A name finds the problem that calls itself so."""
-    assert {"zhu2020-ideal", "zhu2020-lossy", "two-nodes", "quadruple-tank"} <= set(names())
+    assert {"zhu2020-ideal", "zhu2020-lossy", "two-nodes", "quadruple-tank", "inverted-pendulum"} <= set(names())
     for name in names():
         assert find(name).name == name
 
@@ -100,3 +102,55 @@ def test_quadruple_tank_is_designed_and_confirmed() -> None:
     gains = design(problem, method="theorem2-reduced")
     assert verify(gains).holds
     assert gains.certificate.gamma == pytest.approx(gains.certificate.lmi_gamma, rel=1e-3)
+
+
+def test_inverted_pendulum_is_a_rod_on_a_hinge_sampled() -> None:
+    """A and B follow from the length of the rod and g, to the six decimals that the file keeps."""
+    k = 3.0 * 9.81 / (2.0 * 2.0)
+    continuous = np.array([[0.0, 1.0, 0.0], [k, 0.0, 1000.0], [0.0, 0.0, 0.0]])
+    sampled = exponential(0.02 * continuous)
+    problem = find("inverted-pendulum")
+    np.testing.assert_allclose(problem.plant.A, sampled[:2, :2], rtol=0.0, atol=5.1e-7)
+    np.testing.assert_allclose(problem.plant.B[:, 0], sampled[:2, 2], rtol=0.0, atol=5.1e-7)
+    assert np.abs(np.linalg.eigvals(problem.plant.A)).max() == pytest.approx(math.exp(math.sqrt(k) * 0.02), rel=1e-5)
+
+
+def test_inverted_pendulum_is_designed_though_it_is_unstable() -> None:
+    """Seen losses, lossy links, unbiased gains: floor <= exact gain <= the confirmed gamma of the LMI."""
+    problem = find("inverted-pendulum")
+    assert problem.unbiased
+    assert problem.links
+    assert not problem.carries_plant
+    gains = design(problem, method="decomposed")
+    proved = gains.certificate
+    assert verify(gains).holds
+    assert proved.exact is not None
+    assert proved.floor is not None
+    assert 0.0 < proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6)
+
+
+def test_the_errors_of_the_inverted_pendulum_stay_exact_for_hundreds_of_steps() -> None:
+    """x - x_hat of the filters and e of the error model differ by rounding, relative to x, which grows to 1e9."""
+    problem = find("inverted-pendulum")
+    K_bar, H_bar = least_variance_gains(problem)
+    model = error_model(problem, K_bar, H_bar)
+    rng, nx, plant = np.random.default_rng(0), problem.nx, problem.plant
+    x, x_hat, e = np.zeros(nx), np.zeros((problem.n, nx)), np.zeros(problem.n * nx)
+    s, rho = 0, problem.delivery
+    for _ in range(400):
+        w = 0.2 * rng.normal(size=problem.nw)
+        theta = (rng.uniform(size=problem.n) < problem.beta).astype(float)
+        came = rng.uniform(size=rho.shape) < rho
+        nu = [theta[j] * (node.C @ (x - x_hat[j]) + node.D @ w) for j, node in enumerate(problem.nodes)]
+        x_hat_next = np.zeros_like(x_hat)
+        for i in range(problem.n):
+            for j in problem.neighbours(s, i):
+                K_ij, H_ij = K_bar[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx], H_bar[s, i * nx : (i + 1) * nx, j]
+                x_hat_next[i] += K_ij @ x_hat[j] + H_ij * nu[j] if came[i, j] else K_ij @ x_hat[i]
+        e = step(model, s, theta, e, w, came)
+        x, x_hat = plant.A @ x + plant.B @ w, x_hat_next
+        s = int(rng.choice(len(problem.topologies), p=problem.markov.transition[s]))
+    size = np.abs(x).max()
+    assert size > 1e6
+    np.testing.assert_allclose((x - x_hat).ravel(), e, rtol=0.0, atol=1e-13 * size)
+    assert np.abs(e).max() < 1e-4 * size
