@@ -8,6 +8,7 @@ multiplies K_ij and H_ij by a_ij. The problem that they are analysed on is the o
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,7 +108,9 @@ class Analysis(NamedTuple):
                 f"NOT mean-square stable: in the long run each step multiplies E|error|^2 by {self.radius:.6g}; "
                 "no gamma bounds the error"
             )
-            return "\n".join([*lines, f"ladder     {self.ladder.floor:.6f}  floor"])
+            if self.ladder.floor is None:
+                lines.append("no other gains do better: the sensors do not show an unstable part of the plant")
+            return "\n".join(lines)
         assert self.ladder.exact is not None
         assert self.u is not None
         assert self.w is not None
@@ -162,7 +165,8 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
     model = error_model(problem, *stacked_links(problem, given.K, given.H))
     gain = exact_gain(model)
     exact = (gain.low, gain.high) if gain.stable else None
-    ladder = Ladder(floor(problem), exact, gamma=None, theorem2_exact=None, theorem2=None)
+    least = floor(problem)
+    ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)
     if not gain.stable:
         return Analysis(problem, given, False, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
     policy = worst_policy(model, horizon=gain.horizon)

@@ -193,6 +193,20 @@ def test_unbiased_problems_want_unbiased_gains(tmp_path: Path) -> None:
         load_given(biased, problem)
 
 
+def test_a_plant_that_no_sensor_shows_is_said(tmp_path: Path) -> None:
+    """Where the floor is infinite, no gains help; in JSON there is no floor."""
+    document = find("two-nodes").document() | {"unbiased": True}
+    document["plant"]["A"] = [[1.25]]
+    for node in document["node"]:
+        node["C"] = [[0.0]]
+    problem = Problem.from_document(document)
+    gains = _scalars(tmp_path / "any.json", K={"left": 0.5, "right": 0.75}, H={"left": 0.6, "right": 0.45})
+    found = analyse(problem, load_given(gains, problem))
+    assert not found.stable
+    assert "no other gains do better" in found.text()
+    assert json.loads(json.dumps(found.document(), allow_nan=False))["floor"] is None
+
+
 def _scalars(path: Path, K: dict[str, float], H: dict[str, float]) -> Path:
     """The same gains at both nodes of two-nodes."""
     rows = {

@@ -9,6 +9,7 @@ import pytest
 from made_recordings import record, simulate
 
 from agent.contract.gains import Gains
+from designer import effort
 from designer.cli import main
 from designer.problems import names
 from designer.synthesis import EXACT, METHODS
@@ -49,6 +50,17 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     printed = capsys.readouterr().out
     assert printed.startswith("two-nodes by decomposed: gamma = 1.41421")
     assert "ladder     1.414214  floor\n" in printed
+
+
+def test_the_default_of_a_large_problem(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where exact would take too long the decomposed LMI is solved, and one sentence says so."""
+    monkeypatch.setattr(effort, "LONGEST", 0.0)
+    assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["method"] == "decomposed"
+    assert printed.err == "method decomposed: exact would take about 2 seconds here; --method exact asks for it\n"
 
 
 def test_what_if(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
