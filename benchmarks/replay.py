@@ -94,7 +94,7 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
         name: {mode: [link.sender for link in links] for mode, links in part.links.items()}
         for name, part in slices.items()
     }
-    plant, chain = SimulatedPlant(gains, seed=seed), schedule.modes(problem, seed=seed)
+    plant, chain = SimulatedPlant(problem, seed=seed), schedule.modes(problem, seed=seed)
     x_hat, mode, sent = (
         {name: np.zeros(problem.nx) for name in problem.node_names},
         "",

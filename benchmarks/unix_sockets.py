@@ -96,7 +96,7 @@ def node(peers: Peers, gains: Gains, name: str, steps: int, window: int | None) 
 
 def plant(peers: Peers, gains: Gains, steps: int, seed: int) -> str:
     """Publishes the measurements of a step when it sees the mode of that step."""
-    simulated = SimulatedPlant(gains, seed=seed)
+    simulated = SimulatedPlant(gains.problem, seed=seed)
     for k in range(steps):
         peers.take(COORDINATOR)
         state, measurements = simulated.advance(k)

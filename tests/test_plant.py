@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_recordings import observer_gains, random_gains, random_problem, real_problem
+from made_recordings import random_problem, real_problem
 
 from agent.contract.errors import RunBroken
 from agent.contract.schedule import DisturbanceSource, Losses
@@ -15,7 +15,7 @@ def test_states_and_measurements_are_equations_1_and_2() -> None:
     """Hidden losses leave the disturbance; of a node that sees its losses the measurement is whole, or empty."""
     problem = real_problem(4, radius=1.02)
     losses, source = Losses(problem, seed=2), DisturbanceSource(problem, seed=2)
-    plant = SimulatedPlant(observer_gains(problem), seed=2)
+    plant = SimulatedPlant(problem, seed=2)
     x, empty = np.zeros(problem.nx), 0
     for k in range(60):
         state, measurements = plant.advance(k)
@@ -34,7 +34,7 @@ def test_states_and_measurements_are_equations_1_and_2() -> None:
 
 def test_hidden_losses_are_never_empty() -> None:
     problem = random_problem(4)
-    plant = SimulatedPlant(random_gains(problem), seed=2)
+    plant = SimulatedPlant(problem, seed=2)
     lost = 0
     for k in range(60):
         state, measurements = plant.advance(k)
@@ -44,13 +44,13 @@ def test_hidden_losses_are_never_empty() -> None:
 
 
 def test_a_step_out_of_turn_is_refused() -> None:
-    plant = SimulatedPlant(random_gains(random_problem(4)), seed=2)
+    plant = SimulatedPlant(random_problem(4), seed=2)
     plant.advance(0)
     with pytest.raises(RunBroken, match="the mode of step 2 came where that of step 1 was due"):
         plant.advance(2)
 
 
 def test_a_state_that_outgrows_float64_ends_the_run_in_one_sentence() -> None:
-    plant = SimulatedPlant(observer_gains(real_problem(4, radius=10.0)), seed=2)
+    plant = SimulatedPlant(real_problem(4, radius=10.0), seed=2)
     with pytest.raises(RunBroken, match=r"^the state of the plant is not finite at step \d+; its A lets it grow$"):
         all(plant.advance(k) for k in range(400))
