@@ -90,8 +90,8 @@ def _sign(S: arb_mat, sizes: Array) -> Sign:
 
     Floats find a congruence, balls prove: X holds the eigenvectors of the scaled midpoints, and G = X'SX is nearly
     diagonal. If there are d > 0 with G_ii d_i > sum over j != i of |G_ij| d_j for every i, then diag(d) G diag(d) is
-    strictly diagonally dominant, so it is positive definite by Gershgorin's theorem, and so is S (if Sv were not
-    positive along some v, neither would G be; X is then regular). If some G_ii < 0, that column x of X has x'Sx < 0.
+    strictly diagonally dominant, so G is positive definite by Gershgorin's theorem. X is then regular, for Xv = 0
+    gives v'Gv = 0; so S is positive definite too. If some G_ii < 0, that column x of X has x'Sx < 0.
     """
     with np.errstate(all="ignore"):  # what overflows is left undecided
         scale = np.exp2(np.round(-np.log2(np.where(sizes > 0.0, sizes, 1.0)) / 2.0))  # powers of two scale exactly

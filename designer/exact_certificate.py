@@ -119,10 +119,11 @@ def _relative(Z: list[arb_mat], P: list[arb_mat]) -> float:
     if not (np.isfinite(P_middle).all() and np.isfinite(Z_middle).all()):
         return np.inf
     try:
-        L = np.linalg.cholesky(P_middle)
-        half = np.linalg.solve(L, Z_middle)
-        relative = np.linalg.solve(L, half.swapaxes(1, 2))
-        return max(float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max()), 0.0)
+        with np.errstate(all="ignore"):
+            L = np.linalg.cholesky(P_middle)
+            half = np.linalg.solve(L, Z_middle)
+            relative = np.linalg.solve(L, half.swapaxes(1, 2))
+            return max(float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max()), 0.0)
     except np.linalg.LinAlgError:
         return np.inf
 
