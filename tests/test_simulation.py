@@ -183,22 +183,23 @@ def mean_squares(gains: Gains, *, steps: int) -> Array:
     return np.array(found)
 
 
-def holds_the_truth(gains: Gains, truth: Array, *, runs: int = 3000) -> bool:
-    """The intervals of all steps hold the true means."""
-    ensemble = simulation.simulate(gains, runs=runs, steps=len(truth), processes=1)
+def holds(ensemble: Ensemble, truth: Array) -> bool:
+    """The intervals of all steps hold these means."""
     rounding = 1e-9 * truth  # where nothing depends on chance
     return bool(((ensemble.low - rounding <= truth) & (truth <= ensemble.high + rounding)).all())
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("disturbance", DISTURBANCES, ids=lambda disturbance: disturbance["kind"])
+@pytest.mark.parametrize(
+    ("case", "disturbance"),
+    [*((case, DISTURBANCES[0]) for case in CASES), ("sticky", DISTURBANCES[1]), ("unstable", DISTURBANCES[1])],
+)
 def test_the_intervals_hold_the_moments_of_the_error_model(case: str, disturbance: dict[str, Any]) -> None:
     gains = edited(CASES[case](), disturbance=disturbance)
     truth = mean_squares(gains, steps=30)
-    assert truth[1:].min() >= 0.0
-    assert truth.max() > 0.0
-    assert holds_the_truth(gains, truth)
-    assert not holds_the_truth(gains, 1.1 * truth)
+    assert truth[1:].max() > 0.0
+    ensemble = simulation.simulate(gains, runs=2000, steps=30, processes=1)
+    assert holds(ensemble, truth)
+    assert not holds(ensemble, 1.1 * truth)
 
 
 # what a wrong simulation is found by
@@ -241,13 +242,13 @@ def plant_mutant(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 LOSSY_LINK = [{"receiver": "poor", "sender": "good", "delivery_probability": 0.5}]
 
 
-@pytest.mark.parametrize("mutant", MUTANTS)
+@pytest.mark.parametrize("mutant", ["none", *MUTANTS])
 def test_the_moments_find_a_wrong_simulation(mutant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     gains = edited(observer_gains(sticky(link=LOSSY_LINK)), disturbance={"kind": "white", "deviation": 1.0})
     truth = mean_squares(gains, steps=40)
-    assert holds_the_truth(gains, truth)
     plant_mutant(mutant, monkeypatch)
-    assert not holds_the_truth(gains, truth)
+    ensemble = simulation.simulate(gains, runs=3000, steps=40, processes=1)
+    assert holds(ensemble, truth) == (mutant == "none")
 
 
 # the worst fixed disturbance
@@ -258,9 +259,12 @@ def case_of(name: str) -> tuple[Gains, Disturbance]:
     return claiming(gains, exact_gain(model_of(gains)).high), worst_for(gains)
 
 
-def comes_close(gains: Gains, worst: Disturbance, *, runs: int = 4000) -> bool:
+def driven(gains: Gains, worst: Disturbance) -> Ensemble:
+    return simulation.simulate(gains, runs=3000, steps=len(worst.w) + 5, w=worst.w, processes=1)
+
+
+def comes_close(ensemble: Ensemble, worst: Disturbance) -> bool:
     """Driven by the worst case, the mean at its peak step is gain^2 within 3 %, and gamma is nowhere exceeded."""
-    ensemble = simulation.simulate(gains, runs=runs, steps=len(worst.w) + 5, w=worst.w, processes=1)
     peak = len(worst.w)
     near = abs(ensemble.mean[peak] / worst.gain**2 - 1.0) < 0.03
     return near and ensemble.mean.argmax() == peak and bool((ensemble.low <= ensemble.bound).all())
@@ -268,21 +272,22 @@ def comes_close(gains: Gains, worst: Disturbance, *, runs: int = 4000) -> bool:
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_worst_case_comes_close_to_the_gain_and_never_exceeds_gamma(case: str) -> None:
+    """And a gamma a tenth below that gain is refuted."""
     gains, worst = case_of(case)
     assert worst.gain <= gains.certificate.gamma
-    assert comes_close(gains, worst)
-    claim = claiming(gains, 0.9 * worst.gain)
-    refuted = simulation.simulate(claim, runs=4000, steps=len(worst.w) + 5, w=worst.w, processes=1)
-    assert refuted.least[len(worst.w)] > refuted.bound[len(worst.w)]
-    assert refuted.refuted_at is not None
+    ensemble = driven(gains, worst)
+    assert comes_close(ensemble, worst)
+    assert ensemble.refuted_at is None
+    too_low = dataclasses.replace(ensemble, gamma=0.9 * worst.gain)
+    assert too_low.least[len(worst.w)] > too_low.bound[len(worst.w)]
+    assert too_low.refuted_at is not None
 
 
 @pytest.mark.parametrize("mutant", ["modes are independent", "losses too rare", "losses too frequent"])
 def test_the_worst_case_finds_a_wrong_simulation(mutant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     gains, worst = case_of("sticky")
-    assert comes_close(gains, worst)
     plant_mutant(mutant, monkeypatch)
-    assert not comes_close(gains, worst)
+    assert not comes_close(driven(gains, worst), worst)
 
 
 # what is refuted, and what is not

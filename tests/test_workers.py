@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from jobs import die, refuse, stay, threads_after_a_product, where
 from runs import children, wait_until_gone
 
 from agent.contract.errors import InputError, RunBroken, Unattainable
@@ -21,38 +20,17 @@ from designer import workers
 from designer.workers import each
 
 
-def where(item: int) -> tuple[int, int]:
-    """Late items are done first, so that the order is not that of finishing; and who did it."""
-    if item == 0:
-        sum(math.sqrt(number) for number in range(200_000))
-    return item, os.getpid()
+def own_children() -> set[multiprocessing.process.BaseProcess]:
+    """Worker processes; those of Dask are daemons."""
+    return {process for process in multiprocessing.active_children() if not process.daemon}
 
 
-def refuse(item: int) -> int:
-    if item == 2:
-        raise Unattainable("item 2 has no answer")
-    return item
-
-
-def die(item: int) -> int:
-    os._exit(item)
-
-
-def stay(item: int) -> int:
-    """Item 0 is done; the others never are."""
-    if item:
-        threading.Event().wait()
-    return item
-
-
-def threads_after_a_product(_item: int) -> tuple[int, int]:
-    """Threads of this process before and after numpy has multiplied matrices."""
-    tasks = Path("/proc/self/task")
-    before = len(list(tasks.iterdir()))
-    import numpy as np
-
-    np.ones((300, 300)) @ np.ones((300, 300))
-    return before, len(list(tasks.iterdir()))
+@pytest.fixture(autouse=True)
+def _nobody_stays() -> Iterator[None]:
+    """No test leaves a process that was not there before."""
+    before = own_children()
+    yield
+    assert own_children() == before
 
 
 # on processes of this machine
@@ -61,7 +39,6 @@ def test_results_come_in_the_order_of_the_items() -> None:
     assert [item for item, _ in done] == list(range(7))
     assert 1 <= len({pid for _, pid in done} - {os.getpid()}) <= 2
     assert os.getpid() not in {pid for _, pid in done}
-    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.parametrize(("items", "processes"), [([4], 3), ([1, 2], 1), ([], 2)])
@@ -79,29 +56,27 @@ def test_a_worker_takes_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_error_of_a_job_is_raised_here_and_ends_the_rest() -> None:
     with pytest.raises(Unattainable, match="item 2 has no answer"):
         list(each(refuse, range(20), processes=2))
-    assert multiprocessing.active_children() == []
 
 
 def test_closing_the_iterator_ends_jobs_that_run() -> None:
-    jobs = each(stay, range(5), processes=2)
-    assert next(jobs) == 0
-    assert isinstance(jobs, Iterator)
-    jobs.close()  # type: ignore[attr-defined]
-    assert multiprocessing.active_children() == []
+    running = each(stay, range(5), processes=2)
+    assert next(running) == 0
+    assert own_children()
+    running.close()  # type: ignore[attr-defined]
+    assert not own_children()
 
 
 def test_a_worker_that_dies_is_said() -> None:
     with pytest.raises(RunBroken, match="a worker process died"):
         list(each(die, range(1, 4), processes=2))
-    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_no_worker_outlives_whoever_started_it(how: signal.Signals, tmp_path: Path) -> None:
     """Ctrl-C ends jobs that run, and so does the end of the process that waits for them."""
-    script = tmp_path / "jobs.py"
+    script = tmp_path / "starter.py"
     script.write_text(
-        "from test_workers import stay\nfrom designer.workers import each\n"
+        "from jobs import stay\nfrom designer.workers import each\n"
         'if __name__ == "__main__":\n'
         "    for done in each(stay, range(5), processes=2):\n"
         "        print(done, flush=True)\n"
