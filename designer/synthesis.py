@@ -16,6 +16,7 @@ from agent.contract.problem import Problem
 from designer.back_off import Confirmed, back_off, least_gamma, satisfies_17
 from designer.certificate import check
 from designer.descent import Progress
+from designer.diagnosis import explained, refuse_hopeless
 from designer.effort import default_method
 from designer.error_model import error_model, link_gains, stacked_links
 from designer.exact_design import design_exact, with_ladder
@@ -43,19 +44,39 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
 
     The default method is "exact" where that takes at most about ten minutes, else "decomposed".
     `progress` is called during the method "exact" only, which also returns its best gains on KeyboardInterrupt.
-    Raises InputError for an unknown method, Unattainable where no gains or no certificate were found.
+    Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
+    as far as it is known.
     """
     method = default_method(problem) if method is None else method
     if method not in METHODS and method != EXACT:
         raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
     if not problem.plant.M.any():
         raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
-    if method == EXACT:
-        return with_worst_case(design_exact(problem, progress=progress))
+    refuse_hopeless(problem)
+    try:
+        return with_worst_case(
+            design_exact(problem, progress=progress) if method == EXACT else _by_lmi(problem, method)
+        )
+    except Unattainable as error:
+        raise explained(problem, error, _solvable) from None
+
+
+def _solvable(problem: Problem) -> bool:
+    """Whether the decomposed LMI has an answer that is confirmed."""
+    from designer.lmi import decomposed
+
+    try:
+        _first_confirmed(problem, "decomposed", decomposed.answers(problem, last_resort=False))
+    except Unattainable:
+        return False
+    return True
+
+
+def _by_lmi(problem: Problem, method: str) -> Gains:
     started = time.perf_counter()
-    solution, (K, H, confirmed), certify = _first_confirmed(problem, method)
+    solution, (K, H, confirmed), certify = _first_confirmed(problem, method, METHODS[method](problem))
     ended = time.perf_counter()
-    gains = Gains(
+    return Gains(
         problem=problem,
         problem_digest=problem.digest(),
         method=method,
@@ -65,16 +86,17 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
         solver=solution.solver,
         seconds={"solve": ended - started - certify, "certify": certify, "total": ended - started},
     )
-    return with_worst_case(gains)
 
 
-def _first_confirmed(problem: Problem, method: str) -> tuple[LmiSolution, Designed, float]:
+def _first_confirmed(
+    problem: Problem, method: str, answers: Iterator[LmiSolution]
+) -> tuple[LmiSolution, Designed, float]:
     """The first answer whose gamma the check confirms at most _NEAR above the LMI's; else the best that it confirms.
 
     With the seconds that the checks took. Unattainable: no answer, or none that is confirmed.
     """
     seconds, best, refused = 0.0, None, None
-    for solution in METHODS[method](problem):
+    for solution in answers:
         begun = time.perf_counter()
         try:
             designed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(problem, solution)
@@ -163,8 +185,8 @@ def _links(problem: Problem, solution: LmiSolution) -> tuple[LinkMatrices, LinkM
 def _unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Unattainable:
     return Unattainable(
         f"{solution.solver.name} says {solution.solver.status} with gamma {solution.gamma:.6g} for {problem.name}, "
-        f"but the check without a solver does not confirm its answer ({why}); "
-        "try the problem in other units, so that its numbers are near 1"
+        f"but the check without a solver does not confirm its answer ({why})"
+        + ("; try the problem in other units, so that its numbers are near 1" if spectral_radius(problem) < 1.0 else "")
     )
 
 

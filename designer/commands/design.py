@@ -90,9 +90,13 @@ def design_and_save(
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
+    from designer.diagnosis import warnings
     from designer.ladder import ladder_of
     from designer.synthesis import design  # only now: it loads a solver
 
+    warned = warnings(problem)
+    for warning in warned:
+        print(f"warning: {warning}", file=sys.stderr)
     gains = design(problem, method=method or _chosen_method(problem), progress=_descent_progress())
     gains.save(path, force=force)
     proved = gains.certificate
@@ -107,6 +111,7 @@ def design_and_save(
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
+        "warnings": warned,
         "output": str(path),
     }
 

@@ -112,7 +112,7 @@ def solve(problem: Problem) -> LmiSolution:
     return first_accurate(answers(problem))
 
 
-def answers(problem: Problem) -> Iterator[LmiSolution]:
+def answers(problem: Problem, *, last_resort: bool = True) -> Iterator[LmiSolution]:
     """What Clarabel says in natural units, then in the problem's own; then SCS, where Clarabel says nothing at all.
 
     Natural units first: they take fewer steps, and where a state is measured in thousands Clarabel needs them.
@@ -120,7 +120,7 @@ def answers(problem: Problem) -> Iterator[LmiSolution]:
     natural, own = natural_units(problem), Units(np.ones(problem.nx), 1.0)
     plan = [Attempt("", partial(_run, problem, conic.clarabel, natural))]
     plan.append(Attempt(" in the problem's own units", partial(_run, problem, conic.clarabel, own)))
-    if conic.installed(conic.scs):
+    if last_resort and conic.installed(conic.scs):
         plan.append(Attempt("", partial(_run, problem, conic.scs, natural), last_resort=True))
     return attempts.answers(f"the decomposed LMI for {problem.name}", plan)
 

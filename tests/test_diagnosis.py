@@ -1,0 +1,305 @@
+"""Problems that explain why they have no solution, or are close to having none: one made problem for each sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from networks import random_problem, real_network
+
+from agent.contract.errors import Unattainable
+from agent.contract.problem import Problem
+from designer.cli import main
+from designer.diagnosis import closed_classes, explained, obstacles, warnings
+from designer.problems import find
+from designer.synthesis import design
+
+
+def network(
+    *,
+    A: list[list[float]] | None = None,
+    sees: dict[str, list[float]] | None = None,
+    beta: dict[str, float] | None = None,
+    hears: list[dict[str, list[str]]] | None = None,
+    transition: list[list[float]] | None = None,
+    links: dict[tuple[str, str], float] | None = None,
+) -> Problem:
+    """A = 1.2, nodes "1" (which measures x) and "2" (which measures nothing), modes "a", "b", ...; 2 hears 1."""
+    A, sees = A or [[1.2]], sees or {"1": [1.0], "2": [0.0]}
+    hears = hears or [{"2": ["1"]}]
+    modes, nx = [chr(ord("a") + s) for s in range(len(hears))], len(A)
+    document: dict[str, Any] = {
+        "name": "made",
+        "unbiased": True,
+        "plant": {"A": A, "B": np.eye(nx, nx + 1).tolist(), "M": np.eye(nx).tolist()},
+        "node": [
+            {
+                "name": name,
+                "C": [C],
+                "D": [[0.0] * nx + [1.0]],
+                "arrival_probability": (beta or {}).get(name, 1.0),
+                "loss": "seen",
+            }
+            for name, C in sees.items()
+        ],
+        "topology": [{"name": mode, "hears": heard} for mode, heard in zip(modes, hears, strict=True)],
+        "markov": {"transition": transition or [[1.0]], "initial": "a"},
+    }
+    if links:
+        document["link"] = [
+            {"receiver": receiver, "sender": sender, "delivery_probability": rho}
+            for (receiver, sender), rho in links.items()
+        ]
+    return Problem.from_document(document)
+
+
+def refusal(problem: Problem, method: str = "decomposed") -> str:
+    with pytest.raises(Unattainable) as caught:
+        design(problem, method=method)
+    return str(caught.value)
+
+
+# obstacles
+def test_a_sound_network_has_no_obstacle_and_a_design() -> None:
+    """So that the refusals below mean something."""
+    problem = network()
+    assert obstacles(problem) == []
+    assert design(problem, method="decomposed").certificate.holds
+
+
+@pytest.mark.parametrize("method", ["decomposed", "exact"])
+def test_a_node_that_hears_nobody_who_sees_is_blind(method: str) -> None:
+    """Refused before anything is solved, whatever the method."""
+    assert refusal(network(hears=[{"1": ["2"]}]), method) == (
+        'made has no solution: node "2" is blind for ever: neither it nor anyone it hears, directly or through others, '
+        'measures all of the unstable part of the plant (eigenvalue 1.2); let it hear "1"'
+    )
+
+
+def test_what_is_heard_through_others_is_enough() -> None:
+    """3 hears 2 in one mode, 2 hears 1 in another, and both come again and again."""
+    sees = {"1": [1.0], "2": [0.0], "3": [0.0]}
+    both = [[0.5, 0.5], [0.5, 0.5]]
+    assert obstacles(network(sees=sees, hears=[{"3": ["2"]}, {"2": ["1"]}], transition=both)) == []
+    found = obstacles(network(sees=sees, hears=[{"3": ["2"]}, {"2": ["1"]}], transition=[[1.0, 0.0], [0.5, 0.5]]))
+    assert len(found) == 2
+    assert 'node "2" is blind for ever: in mode "a", never left once entered, neither' in found[0]
+    assert 'node "3" is blind for ever' in found[1]
+
+
+def test_an_absorbing_class_of_modes_is_named() -> None:
+    """Two modes that lead to each other and nowhere else, in neither of which 2 hears 1."""
+    transition = [[0.8, 0.2, 0.0], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5]]
+    problem = network(hears=[{"2": ["1"]}, {}, {}], transition=transition)
+    assert closed_classes(problem) == [[1, 2]]
+    assert 'in modes "b" and "c", never left once entered, neither it' in obstacles(problem)[0]
+
+
+def test_what_nobody_measures_is_said() -> None:
+    """No topology helps there."""
+    problem = network(A=[[1.2, 0.0], [0.0, 1.1]], sees={"1": [1.0, 0.0], "2": [1.0, 0.0]})
+    assert obstacles(problem) == [
+        "no node measures the unstable part of the plant (eigenvalue 1.1); some C must see it"
+    ]
+
+
+def test_a_stable_part_needs_no_sensor_and_a_marginal_one_does() -> None:
+    """|lambda| = 1 does not die out by itself."""
+    sees = {"1": [1.0, 0.0], "2": [0.0, 0.0]}
+    assert obstacles(network(A=[[1.2, 0.0], [0.0, 0.99]], sees=sees)) == []
+    assert "(eigenvalue 1)" in obstacles(network(A=[[1.2, 0.0], [0.0, 1.0]], sees=sees))[0]
+
+
+def test_a_complex_pair_is_counted_once() -> None:
+    """A rotation that grows: no node measures it, said once, with its size."""
+    problem = network(A=[[0.0, 1.1], [-1.1, 0.0]], sees={"1": [0.0, 0.0]}, hears=[{}])
+    assert [text.count("of size 1.1") for text in obstacles(problem)] == [1]
+    assert obstacles(network(A=[[0.0, 1.1], [-1.1, 0.0]], sees={"1": [1.0, 0.0]}, hears=[{}])) == []
+
+
+def test_losses_of_the_only_sensor_have_a_least_arrival_probability() -> None:
+    """(1 - beta) 1.2^2 < 1: refused below 1 - 1/1.44 = 0.305556, designed above."""
+    assert refusal(network(beta={"1": 0.3})) == (
+        'made has no solution: node "1" alone sees the unstable part of the plant (eigenvalue 1.2), and its '
+        "measurements arrive with probability 0.3: the mean squared error is multiplied by at least 0.7 x 1.44 = 1.008 "
+        "in each step, and must shrink; arrival_probability must be above 0.305556"
+    )
+    assert design(network(beta={"1": 0.4}), method="decomposed").certificate.holds
+
+
+def test_losses_of_all_sensors_together_are_counted() -> None:
+    """Two that lose half each, against 2.1^2: 0.25 x 4.41 > 1."""
+    problem = network(
+        A=[[2.1]], sees={"1": [1.0], "2": [1.0]}, beta={"1": 0.5, "2": 0.5}, hears=[{"1": ["2"], "2": ["1"]}]
+    )
+    assert obstacles(problem) == [
+        'the measurements of nodes "1" and "2", which alone see the unstable part of the plant (eigenvalue 2.1), are '
+        "all lost together with probability 0.25: the mean squared error is multiplied by at least 0.25 x 4.41 = "
+        "1.1025 in each step, and must shrink; raise their arrival_probability"
+    ]
+
+
+def test_links_have_a_least_delivery_probability_too() -> None:
+    """Node 2 sees nothing and hears node 1 by a link: refused below 0.305556, designed above."""
+    assert obstacles(network(links={("2", "1"): 0.3})) == [
+        'all messages to node "2" (from "1") are lost together with probability 0.7: against the unstable part of the '
+        "plant (eigenvalue 1.2), the mean squared error is multiplied by at least 0.7 x 1.44 = 1.008 in each step, and "
+        "must shrink; raise their delivery_probability"
+    ]
+    assert design(network(links={("2", "1"): 0.4}), method="decomposed").certificate.holds
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_obstacles_are_found_only_where_there_is_no_design(seed: int) -> None:
+    """Random unstable networks: none that can be designed is refused; and stable ones never are."""
+    problem = real_network(random_problem(seed), seen=True, unbiased=True, radius=1.2, delivery=0.8)
+    assert design(problem, method="decomposed").certificate.holds
+    assert obstacles(random_problem(seed)) == []
+
+
+# relaxing
+DWELLS = [[0.95, 0.05], [0.5, 0.5]]
+
+
+def test_the_mode_and_the_topology_that_are_in_the_way_are_found() -> None:
+    """Node 2 hears node 1 in mode b only, and the chain stays in a too long; nobody is blind for ever."""
+    problem = network(hears=[{}, {"2": ["1"]}], transition=DWELLS)
+    assert obstacles(problem) == []
+    text = refusal(problem)
+    assert "if every node heard every other in every mode it would have a solution" in text
+    assert text.endswith('mode "a" alone has no solution')
+
+
+def test_the_node_that_loses_too_much_is_found() -> None:
+    """In the mode that lasts, node 1 has only its own sensor, which loses 9 of 10."""
+    problem = network(
+        sees={"1": [1.0], "2": [1.0]}, beta={"1": 0.1, "2": 0.95}, hears=[{}, {"1": ["2"]}], transition=DWELLS
+    )
+    text = refusal(problem)
+    assert 'with arrival_probability 1 at node "1" it would have a solution' in text
+    assert 'at node "2"' not in text
+
+
+def test_the_link_that_loses_too_much_is_found() -> None:
+    """In the mode that lasts, the blind node 3 hears node 1 by a link that loses 9 of 10; in the other node 2."""
+    problem = network(
+        sees={"1": [1.0], "2": [1.0], "3": [0.0]},
+        hears=[{"3": ["1"]}, {"3": ["2"]}],
+        transition=DWELLS,
+        links={("3", "1"): 0.1},
+    )
+    assert 'with delivery_probability 1 from "1" to "3" it would have a solution' in refusal(problem)
+
+
+def test_losses_that_only_help_together_are_found() -> None:
+    """Neither alone is enough: the first relaxation of all nodes, or of all links, or of both, that helps is said."""
+    problem = network(
+        sees={"1": [1.0], "2": [1.0]}, beta={"1": 0.5, "2": 0.5}, links={("2", "1"): 0.9}, hears=[{"2": ["1"]}]
+    )
+
+    def solvable(relaxed: Problem) -> bool:
+        return bool((relaxed.beta == 1.0).all() and (relaxed.delivery == 1.0).all())
+
+    text = str(explained(problem, Unattainable("why"), solvable))
+    assert text == "why; with no measurement and no message lost it would have a solution"
+    text = str(explained(problem, Unattainable("why"), lambda relaxed: bool((relaxed.beta == 1.0).all())))
+    assert text == "why; with arrival_probability 1 at every node it would have a solution"
+    text = str(explained(problem, Unattainable("why"), lambda relaxed: bool((relaxed.delivery == 1.0).all())))
+    assert text == 'why; with delivery_probability 1 from "1" to "2" it would have a solution'
+    assert str(explained(problem, Unattainable("why"), lambda relaxed: False)).endswith(
+        "no single relaxation of the problem helps"
+    )
+
+
+def test_a_stable_plant_is_said_to_have_a_solution() -> None:
+    """Then it is arithmetic, and the numbers that make it hard are listed."""
+    problem = changed(find("two-nodes"), lambda document: document["plant"].update(M=[[1e7]]))
+    text = str(explained(problem, Unattainable("why"), lambda relaxed: False))
+    assert text.startswith(
+        "why; a solution exists, since the plant is stable: to ignore all measurements is one; the l"
+    )
+
+
+# warnings
+def changed(problem: Problem, change: Any) -> Problem:
+    document = problem.document()
+    change(document)
+    return Problem.from_document(document)
+
+
+def test_the_examples_have_nothing_to_warn_of() -> None:
+    """Nor has a noise-free sensor, or one noise in two sensors: D_i D_i' may be singular."""
+    for name in ("zhu2020-ideal", "zhu2020-lossy", "quadruple-tank"):
+        assert warnings(find(name)) == []
+    assert warnings(network(links={("2", "1"): 0.5})) == []
+
+
+def test_a_mode_that_is_never_reached_is_named() -> None:
+    """The gains for it are designed all the same."""
+    problem = network(hears=[{"2": ["1"]}, {"2": ["1"]}], transition=[[1.0, 0.0], [0.5, 0.5]])
+    assert warnings(problem) == [
+        'markov: mode "b" can never be reached from the initial mode "a"; gains are designed for all modes, since '
+        "gamma holds from any"
+    ]
+    assert set(design(problem, method="decomposed").K) == {"a", "b"}
+
+
+def test_a_plant_that_is_nearly_unstable_is_said_so() -> None:
+    """With its spectral radius; not where the errors do not contain the state."""
+    problem = real_network(random_problem(1), radius=0.9995)
+    assert "its spectral radius is 0.9995, above 0.999" in warnings(problem)[0]
+    assert warnings(real_network(random_problem(1), radius=0.9995, unbiased=True, seen=True)) == []
+
+
+def test_scales_that_differ_are_said() -> None:
+    """The smallest and the largest matrix, with their numbers."""
+
+    def change(document: dict[str, Any]) -> None:
+        document["plant"]["B"], document["node"][1]["C"] = [[1e-5, 0.0]], [[20.0]]
+
+    problem = changed(network(), change)
+    assert warnings(problem) == [
+        'the largest number in B is 1e-05, and in C of node "2" 20: they differ by more than 1e+06; units in which '
+        "both are near 1 make the solver more exact"
+    ]
+
+
+def test_rare_arrivals_and_transitions_are_said() -> None:
+    """Each with its number."""
+    problem = network(
+        sees={"1": [1.0], "2": [1.0]},
+        beta={"2": 0.01},
+        hears=[{"2": ["1"]}, {}],
+        transition=[[1.0 - 1e-7, 1e-7], [0.5, 0.5]],
+        links={("2", "1"): 0.02},
+    )
+    assert warnings(problem) == [
+        'node "2": arrival_probability 0.01 is below 0.05; its measurements hardly count',
+        'link from "1" to "2": delivery_probability 0.02 is below 0.05; its messages hardly count',
+        'markov: the probability 1e-07 of going from "a" to "b" is below 1e-06; gamma counts the mode as possible all '
+        "the same",
+    ]
+
+
+PROBLEM = """
+name = "made"
+plant = { A = [[0.5]], B = [[1.0]], M = [[1.0]] }
+node = [{ name = "1", C = [[1.0]], D = [[1.0]], arrival_probability = 0.01 }]
+topology = [{ name = "a", adjacency = [[1]] }]
+markov = { transition = [[1.0]], initial = "a" }
+"""
+
+
+def test_the_command_warns_on_stderr_and_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The design is made all the same."""
+    path = tmp_path / "made.toml"
+    path.write_text(PROBLEM)
+    output = str(tmp_path / "made.gains.json")
+    assert main(["design", str(path), "-o", output, "--method", "decomposed", "--json"]) == 0
+    printed = capsys.readouterr()
+    said = 'node "1": arrival_probability 0.01 is below 0.05; its measurements hardly count'
+    assert f"warning: {said}" in printed.err
+    assert json.loads(printed.out)["warnings"] == [said]
