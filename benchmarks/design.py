@@ -160,7 +160,9 @@ def row(method: str, n: int, facts: dict[str, Any]) -> str:
     return f"{method:<10} {n:5d} {''.join(numbers)} {sizes}  {said}"
 
 
-HEAD = "method     nodes  solver s  whole s    cpu s certify s verify s  peak MB  file MB  LMI gamma  certified  P; solver"
+HEAD = (
+    "method     nodes  solver s  whole s    cpu s certify s verify s  peak MB  file MB  LMI gamma  certified  P; solver"
+)
 
 
 def summary(measured: dict[tuple[str, int], dict[str, Any]]) -> list[str]:
