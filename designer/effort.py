@@ -4,6 +4,7 @@ The time grows with the free entries of the gains (how many steps the search tak
 the error state (what a step costs). The factors are a fit to the processor time of one core: 10 and 17 s for the
 paper's examples (210 free entries, 4 modes, 10 states), 27 s for quadruple-tank (1040, 3, 28), 150 s for 20 nodes
 (1362, 4, 42), and for 30 nodes (2130, 4, 62) more than 900 s. Within a factor of 4 of these; beyond an extrapolation.
+Lossy links make a step dearer, and an unstable plant the search longer: inverted-pendulum takes 18 s in place of 2.
 """
 
 from __future__ import annotations
