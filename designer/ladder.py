@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from agent.contract.gains import Certificate
+from agent.contract.gains import Gains
+from designer.lmi import beyond_paper
 
 _NOTHING = 1e-6  # a floor this small beside the gain says nothing
 
@@ -21,6 +22,7 @@ class Ladder(NamedTuple):
     gamma: float | None  # certified
     theorem2_exact: tuple[float, float] | None  # of Theorem 2's gains, where these are others
     theorem2: float | None  # its bound, as the solver gave it
+    lmi: str = "Theorem 2"  # what the LMI is called: beyond the paper's model it is not Theorem 2's
 
     @property
     def against_theorem2(self) -> float | None:
@@ -45,12 +47,12 @@ class Ladder(NamedTuple):
             (self.floor, "floor"),
             (self.exact and self.exact[1], "exact gain of these gains"),
             (self.gamma, "gamma, certified"),
-            (self.theorem2_exact and self.theorem2_exact[1], "exact gain of Theorem 2's gains"),
-            (self.theorem2, "Theorem 2's bound"),
+            (self.theorem2_exact and self.theorem2_exact[1], f"exact gain of {self.lmi}'s gains"),
+            (self.theorem2, f"{self.lmi}'s bound"),
         ]
         remarks = []
         if self.against_theorem2 is not None:
-            remarks.append(f"{percent(self.against_theorem2)} against Theorem 2's bound")
+            remarks.append(f"{percent(self.against_theorem2)} against {self.lmi}'s bound")
         if self.above_floor is not None:
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
         at = 1 if self.exact is not None else 2
@@ -58,10 +60,12 @@ class Ladder(NamedTuple):
         return [f"{value:.6f}  {name}" for value, name in rungs if value is not None]
 
 
-def ladder_of(certificate: Certificate) -> Ladder:
+def ladder_of(gains: Gains) -> Ladder:
     """The ladder of what a design or a file claims."""
-    gamma = certificate.gamma if certificate.holds else None
-    return Ladder(certificate.floor, certificate.exact, gamma, certificate.lmi_exact, certificate.lmi_gamma)
+    proved = gains.certificate
+    gamma = proved.gamma if proved.holds else None
+    lmi = "the LMI" if beyond_paper(gains.problem) else "Theorem 2"
+    return Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi)
 
 
 def percent(part: float) -> str:

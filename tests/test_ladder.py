@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.effort import LONGEST, default_method, in_words, seconds_of_exact
-from designer.ladder import Ladder, percent
+from designer.ladder import Ladder, ladder_of, percent
 from designer.problems import find, names
+from designer.synthesis import design
 
 
 def test_the_distances() -> None:
@@ -29,6 +31,21 @@ def test_what_is_not_there_is_not_said() -> None:
     assert Ladder(0.5, None, 1.0, None, 1.0).lines()[1] == "1.000000  gamma, certified: 100.0 % above the floor"
     assert Ladder(None, (0.9, 1.0), None, None, None).lines() == ["1.000000  exact gain of these gains"]
     assert Ladder(1e-12, (0.9, 1.0), None, None, None).above_floor is None
+
+
+def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
+    """The name of the LMI stands on every line that speaks of it."""
+    lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI").lines()
+    assert lines[1:] == [
+        "1.000000  exact gain of these gains: -75.0 % against the LMI's bound",
+        "1.000000  gamma, certified",
+        "2.000000  exact gain of the LMI's gains",
+        "4.000000  the LMI's bound",
+    ]
+    document = find("two-nodes").document()
+    gains = design(Problem.from_document(document | {"unbiased": True}), method="decomposed")
+    assert (ladder_of(gains).lmi, ladder_of(gains).theorem2) == ("the LMI", gains.certificate.lmi_gamma)
+    assert ladder_of(design(find("two-nodes"), method="decomposed")).lmi == "Theorem 2"
 
 
 def test_percentages() -> None:

@@ -107,7 +107,7 @@ def design_and_save(
         "lmi_gamma": proved.lmi_gamma,
         "exact": proved.exact,
         "floor": proved.floor,
-        "ladder": ladder_of(proved).document(),
+        "ladder": ladder_of(gains).document(),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
