@@ -12,6 +12,8 @@ Where that covariance settles, the error system is mean-square stable, so these 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from agent.contract.arrays import Array
@@ -89,22 +91,31 @@ def _plant_covariance(problem: Problem) -> Array:
 
 def least_variance_gains(problem: Problem) -> tuple[Array, Array]:
     """K_bar and H_bar at which white w leaves each node the least mean square of e_i, given the others' gains."""
-    modes = len(problem.topologies)
+    modes, nx, columns = len(problem.topologies), problem.nx, measurement_slices(problem)
+    regressions = {(s, i): _regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
     occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
-    K_bar = np.zeros((modes, problem.n * problem.nx, problem.n * problem.nx))
-    H_bar = np.zeros((modes, problem.n * problem.nx, rows_total(problem)))
-    size = problem.nx * (problem.n + (1 if problem.carries_plant else 0))
+    K_bar, H_bar = (
+        np.zeros((modes, problem.n * nx, problem.n * nx)),
+        np.zeros((modes, problem.n * nx, rows_total(problem))),
+    )
+    size = nx * (problem.n + (1 if problem.carries_plant else 0))
     fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
     X = fresh
     joint = np.zeros((modes, size + problem.nw, size + problem.nw))
     joint[:, size:, size:] = occupied[:, None, None] * np.eye(problem.nw)
     for _ in range(_STEPS_OF_NETWORK):
         joint[:, :size, :size] = X
-        for s in range(modes):
-            for i in range(problem.n):
-                _least_square(problem, s, i, joint[s], K_bar, H_bar)
+        for (s, i), regression in regressions.items():
+            rows, best = slice(i * nx, (i + 1) * nx), regression.best(joint[s])
+            for j, part in regression.K.items():
+                K_bar[s, rows, j * nx : (j + 1) * nx] = best[:, part]
+            for j, part in regression.H.items():
+                H_bar[s, rows, columns[j]] = best[:, part]
+            if problem.unbiased:
+                others = sum((best[:, part] for part in regression.K.values()), np.zeros((nx, nx)))
+                K_bar[s, rows, rows] = problem.plant.A - others
         operator = Operator(error_model(problem, K_bar, H_bar))
         operator.transition = chain
         X_next = operator.carry(joint) + fresh
@@ -115,58 +126,56 @@ def least_variance_gains(problem: Problem) -> tuple[Array, Array]:
     return K_bar, H_bar
 
 
-def _least_square(problem: Problem, s: int, i: int, joint: Array, K_bar: Array, H_bar: Array) -> None:
-    """Set the rows of node i in mode s, in place, to those with the least E|e_i(k+1)|^2; joint is that of [eta; w].
+class _Regression(NamedTuple):
+    """e_i(k+1) = t - sum_j K_ij a_j - sum_j H_ij phi_ij nu_j of one node and mode, over [eta; w].
 
-    e_i(k+1) = t - sum_j K_ij a_j - sum_j H_ij phi_ij nu_j, and the best [K H] is E[t r'] E[r r']^-1, r all a_j and
-    phi_ij nu_j. Where gains are unbiased t = A e_i + B w and a_j = phi_ij (e_i - e_j), j != i; elsewhere
-    t = A x + B w and a_j = phi_ij x_hat_j + (1 - phi_ij) x_hat_i.
+    The regressors are all a_j and phi_ij nu_j. Where gains are unbiased t = A e_i + B w and
+    a_j = phi_ij (e_i - e_j), j != i; elsewhere t = A x + B w and a_j = phi_ij x_hat_j + (1 - phi_ij) x_hat_i.
     """
+
+    t: Array  # (nx, n_eta + nw)
+    mean: Array  # (regressors, n_eta + nw)
+    noises: list[Array]  # what chance adds to the mean, each times something of variance 1
+    K: dict[int, slice]  # where a_j stands
+    H: dict[int, slice]  # where phi_ij nu_j stands
+
+    def best(self, joint: Array) -> Array:
+        """[K H] = E[t r'] E[r r']^-1, (nx, regressors), where [eta; w] has the covariance `joint`."""
+        noise = sum((V @ joint @ V.T for V in self.noises), np.zeros((len(self.mean), len(self.mean))))
+        gram = self.mean @ joint @ self.mean.T + noise
+        scale = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
+        inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True)
+        return np.asarray((self.t @ joint @ self.mean.T * scale) @ inverse * scale)
+
+
+def _regression(problem: Problem, s: int, i: int) -> _Regression:
     nx, plant, p = problem.nx, problem.plant, problem.nx if problem.carries_plant else 0
-    heard, columns = problem.neighbours(s, i), measurement_slices(problem)
+    heard, at_w, eye = problem.neighbours(s, i), p + problem.n * problem.nx, np.eye(problem.nx)
     others = [j for j in heard if not problem.unbiased or j != i]
-    size, eye = len(joint) - problem.nw, np.eye(nx)
+    K = {j: slice(k * nx, (k + 1) * nx) for k, j in enumerate(others)}
+    ends = len(others) * nx + np.cumsum([0, *(len(problem.nodes[j].C) for j in heard)])
+    H = {j: slice(int(ends[k]), int(ends[k + 1])) for k, j in enumerate(heard)}
 
     def e(j: int) -> slice:
         return slice(p + j * nx, p + (j + 1) * nx)
 
-    t = np.zeros((nx, len(joint)))
-    t[:, e(i) if problem.unbiased else slice(p)] = plant.A
-    t[:, size:] = plant.B
-    K_part = {j: slice(k * nx, (k + 1) * nx) for k, j in enumerate(others)}
-    ends = len(others) * nx + np.cumsum([0, *(len(problem.nodes[j].C) for j in heard)])
-    H_part = {j: slice(int(ends[k]), int(ends[k + 1])) for k, j in enumerate(heard)}
-    r = np.zeros((int(ends[-1]), len(joint)))  # the mean of the regressors
-    noises = []
+    t = np.zeros((nx, at_w + problem.nw))
+    t[:, e(i) if problem.unbiased else slice(p)], t[:, at_w:] = plant.A, plant.B
+    mean, noises = np.zeros((int(ends[-1]), at_w + problem.nw)), []
     for j in heard:
         node, beta, rho = problem.nodes[j], problem.beta[j], problem.delivery[i, j]
-        phi = np.zeros_like(r)  # what phi_ij multiplies
-        if j in K_part:
+        sent, lost = np.zeros_like(mean), np.zeros_like(mean)  # what phi_ij multiplies, and phi_ij (theta_j - beta_j)
+        if j in K:
             if not problem.unbiased:
-                r[K_part[j], :p] = eye
-                r[K_part[j], e(i)] = -eye
-            phi[K_part[j], e(i)] += eye
-            phi[K_part[j], e(j)] -= eye
-        phi[H_part[j], e(j)] = beta * node.C
-        phi[H_part[j], size:] = (beta if node.seen else 1.0) * node.D
-        r += rho * phi
-        if rho < 1.0:
-            noises.append(np.sqrt(rho * (1.0 - rho)) * phi)
-        if beta < 1.0:
-            lost = np.zeros_like(r)
-            if node.seen:
-                lost[H_part[j], e(j)], lost[H_part[j], size:] = node.C, node.D
-            else:
-                lost[H_part[j], :p] = node.C
-            noises.append(np.sqrt(rho * beta * (1.0 - beta)) * lost)
-    gram = r @ joint @ r.T + sum((noise @ joint @ noise.T for noise in noises), np.zeros((len(r), len(r))))
-    scale = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
-    inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True)
-    best = (t @ joint @ r.T * scale) @ inverse * scale
-    rows = slice(i * nx, (i + 1) * nx)
-    if problem.unbiased:
-        K_bar[s, rows, rows] = plant.A - sum((best[:, K_part[j]] for j in others), np.zeros((nx, nx)))
-    for j in others:
-        K_bar[s, rows, j * nx : (j + 1) * nx] = best[:, K_part[j]]
-    for j in heard:
-        H_bar[s, rows, columns[j]] = best[:, H_part[j]]
+                mean[K[j], :p], mean[K[j], e(i)] = eye, -eye  # x_hat_i
+            sent[K[j], e(i)] += eye
+            sent[K[j], e(j)] -= eye
+        sent[H[j], e(j)], sent[H[j], at_w:] = beta * node.C, (beta if node.seen else 1.0) * node.D
+        if node.seen:
+            lost[H[j], e(j)], lost[H[j], at_w:] = node.C, node.D
+        elif beta < 1.0:
+            lost[H[j], :p] = node.C
+        mean += rho * sent
+        noises += [np.sqrt(rho * (1.0 - rho)) * sent] if rho < 1.0 else []
+        noises += [np.sqrt(rho * beta * (1.0 - beta)) * lost] if beta < 1.0 else []
+    return _Regression(t, mean, noises, K, H)
