@@ -98,6 +98,13 @@ def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], addre
                 yield future.result()
         except distributed.KilledWorker as error:
             raise RunBroken(f"workers of the Dask cluster at {address} died: {error}") from None
+        except (RuntimeError, ImportError) as error:
+            if isinstance(error, RuntimeError) and "deserialization" not in str(error):
+                raise
+            raise InputError(
+                f"the Dask cluster at {address} cannot load the jobs; its scheduler and workers need the peakmesh of "
+                "this machine"
+            ) from error
         finally:
             client.cancel(futures)
     finally:

@@ -130,6 +130,41 @@ def test_a_job_that_kills_its_worker_is_said(cluster: str) -> None:
         list(each(die, [1], dask=cluster))
 
 
+FOREIGN_CLUSTER = """
+import asyncio, sys
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "jobs":
+            raise ModuleNotFoundError(f"No module named {name!r}")
+sys.meta_path.insert(0, Nothing())
+from distributed import Scheduler, Worker
+async def main():
+    nowhere = {"dashboard_address": "127.0.0.1:0"}
+    async with Scheduler(host="127.0.0.1", port=0, **nowhere) as scheduler, Worker(scheduler.address, **nowhere):
+        print(scheduler.address, flush=True)
+        await asyncio.to_thread(sys.stdin.read)
+asyncio.run(main())
+"""
+
+
+def test_a_cluster_that_lacks_the_code_is_said() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", FOREIGN_CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as foreign:
+        assert foreign.stdin is not None
+        assert foreign.stdout is not None
+        try:
+            address = foreign.stdout.readline().strip()
+            with pytest.raises(InputError, match="cannot load the jobs; its scheduler and workers need the peakmesh"):
+                list(each(where, [1, 2], dask=address))
+        finally:
+            foreign.kill()
+
+
 def test_a_cluster_without_workers_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     from distributed import LocalCluster
 
