@@ -242,5 +242,5 @@ METHODS: dict[str, Callable[[Problem], Iterator[LmiSolution]]] = {
 # Methods whose gains may be moved a little together with P: their P stays small enough to store for large networks.
 # The others are the paper's, and their gains stay as the solver gave them.
 MOVABLE = frozenset({"decomposed"})
-_NEAR = 1e-4  # a certified gamma this little above the LMI's, relatively, is taken at once
+_NEAR = 5e-4  # a certified gamma this little above the LMI's, relatively, is taken at once
 STEPS_INWARDS = (0.0, 1e-6, 3e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
