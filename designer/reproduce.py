@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.consensus import consensus_gains
+from designer.barrier import StackedGains
+from designer.consensus import consensus_gains, least_variance_gains
 from designer.exact_design import exact_bounds
 from designer.floor import floor
 from designer.problems import find
@@ -48,7 +49,14 @@ class Computed:
 
     @cached_property
     def consensus(self) -> float | None:
-        bounds = exact_bounds(self.problem, *consensus_gains(self.problem, weight=_CONSENSUS_WEIGHT))
+        return self._exact_of(consensus_gains(self.problem, weight=_CONSENSUS_WEIGHT))
+
+    @cached_property
+    def least_variance(self) -> float | None:
+        return self._exact_of(least_variance_gains(self.problem))
+
+    def _exact_of(self, gains: StackedGains) -> float | None:
+        bounds = exact_bounds(self.problem, *gains)
         return None if bounds is None else bounds[1]
 
     def _designed(self, method: str) -> Gains:
@@ -78,6 +86,7 @@ ROWS = (
     Row("certified", "Theorem 2's gains: gamma certified", lambda computed: computed.theorem2.certificate.gamma),
     Row("theorem2_exact", "Theorem 2's gains: their exact gain", _exact_of_theorem2),
     Row("consensus", "Kalman-consensus gains: their exact gain", lambda computed: computed.consensus),
+    Row("least_variance", "gains of least variance: their exact gain", lambda computed: computed.least_variance),
     Row("exact", "designed for the exact gain: certified", lambda computed: computed.exact.certificate.gamma),
     Row("floor", "floor: no linear filter is below it", lambda computed: floor(computed.problem)),
 )
@@ -108,7 +117,7 @@ class Reproduced(NamedTuple):
     def cell(value: float | None, key: str) -> str:
         """One entry of the table."""
         if value is None:
-            return {"consensus": "not stable", "scs": "no answer"}.get(key, "-")
+            return {"consensus": "not stable", "least_variance": "not stable", "scs": "no answer"}.get(key, "-")
         return f"{value:g}" if key == "printed" else f"{value:.6f}"
 
     def remarks(self) -> list[str]:
