@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from flint import arb, arb_mat
 
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.balls import add, exact, identity, part
+from designer.balls import add, blocks, exact, filled, identity, part
 
 
 class Noise(NamedTuple):
@@ -66,6 +67,7 @@ class BallModel:
             AB, noise = self._mode(problem, s, K, H)
             self.AB.append(AB)
             self.noise.append(noise)
+        self.filled = [filled(AB) for AB in self.AB]
 
     def _sensor(self, problem: Problem, j: int) -> Sensor:
         node = problem.nodes[j]
@@ -150,9 +152,20 @@ class BallModel:
 
     def _joint(self, s: int, Y: list[arb_mat]) -> arb_mat:
         Y_bar = sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
-        AB = self.AB[s]
-        S = AB.transpose() * (Y_bar * AB)
+        S = self._mean(s, Y_bar)
         for noise in self.noise[s]:
             core = noise.E.transpose() * part(Y_bar, noise.rows, noise.rows) * noise.E
             add(S, noise.columns, noise.columns, noise.C.transpose() * core * noise.C * noise.variance)
+        return S
+
+    def _mean(self, s: int, Y_bar: arb_mat) -> arb_mat:
+        """[A B]'Y_bar[A B], by the blocks of Y_bar: those of a P = diag{R, Q_1, ...} meet few columns of [A B] each."""
+        AB, found = self.AB[s], blocks(Y_bar)
+        if len(found) == 1:
+            return AB.transpose() * (Y_bar * AB)
+        S = arb_mat(AB.ncols(), AB.ncols())
+        for rows in found:
+            columns = np.flatnonzero(self.filled[s][rows].any(axis=0)).tolist()
+            AB_rows = part(AB, rows, columns)
+            add(S, columns, columns, AB_rows.transpose() * (part(Y_bar, rows, rows) * AB_rows))
         return S

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from flint import arb, arb_mat
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 
@@ -58,22 +59,27 @@ def sign(S: arb_mat, sizes: Array) -> Sign:
 
     Where S falls apart into blocks, as (18) does by nodes, each is looked at by itself.
     """
-    blocks = _blocks(S)
-    if len(blocks) == 1:
+    found = blocks(S)
+    if len(found) == 1:
         return _sign(S, sizes)
-    signs = [_sign(part(S, block, block), sizes[block]) for block in blocks]
+    signs = [_sign(part(S, block, block), sizes[block]) for block in found]
     return Sign(
-        proved=all(found.proved for found in signs),
-        refuted=any(found.refuted for found in signs),
-        least=min(found.least for found in signs),
+        proved=all(each.proved for each in signs),
+        refuted=any(each.refuted for each in signs),
+        least=min(each.least for each in signs),
     )
 
 
-def _blocks(S: arb_mat) -> list[list[int]]:
-    """The indices of S, in sets between which every entry is exactly 0."""
-    joined = np.array([not entry.is_zero() for entry in S.entries()]).reshape(S.nrows(), S.ncols())
+def filled(matrix: arb_mat) -> NDArray[np.bool_]:
+    """Which entries are not exactly 0."""
+    return np.array([not entry.is_zero() for entry in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
+
+
+def blocks(S: arb_mat) -> list[list[int]]:
+    """The indices of a square matrix, in sets between which every entry is exactly 0."""
+    joined = filled(S)
     joined |= joined.T
-    left, blocks = np.ones(len(joined), dtype=bool), []
+    left, found = np.ones(len(joined), dtype=bool), []
     while left.any():
         block = np.zeros(len(joined), dtype=bool)
         reached = left & (np.cumsum(left) == 1)  # the first of those left
@@ -81,8 +87,8 @@ def _blocks(S: arb_mat) -> list[list[int]]:
             block |= reached
             reached = joined[reached].any(axis=0) & ~block
         left &= ~block
-        blocks.append(np.flatnonzero(block).tolist())
-    return blocks
+        found.append(np.flatnonzero(block).tolist())
+    return found
 
 
 def _sign(S: arb_mat, sizes: Array) -> Sign:
