@@ -1,11 +1,10 @@
 """From a solver's answer, which lies on the boundary of (17), to a P and a gamma that can be proved.
 
 A solver's P satisfies (17) with nothing to spare, or misses it by its tolerance. Take any P0 with
-P0 - L(P0) >= W/2 > 0, where L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i is the left upper corner of (17). Then
-(1 - t)(P + tau P0) has, on the diagonal of (17), t I more in w and tau W/2 more in eta; the cross terms that
-P0 brings are outweighed if tau <= t / (2 lambda_max(B'P0_bar B + 2 C'W^-1 C)), C = A'P0_bar B. So (17) becomes
-strict, and gamma grows by about t/2 of itself. Where noise acts on w, as seen losses do, B'P0_bar B and A'P0_bar B
-stand for the corners of the whole quadratic form, noise within.
+P0 - L(P0) >= W/2 > 0, L of `Operator.corner`. Then (1 - t)(P + tau P0) has, on the diagonal of (17), t I more in w and
+tau W/2 more in eta; the cross terms that P0 brings are outweighed if
+tau <= t / (2 lambda_max(B'P0_bar B + 2 C'W^-1 C)), C = A'P0_bar B, where B'P0_bar B and C stand for the corners of
+`Operator.joint`. So (17) becomes strict, and gamma grows by about t/2 of itself.
 
 Candidates are screened by Cholesky in floats; the first that passes is proved in ball arithmetic, or the next is tried.
 """
@@ -98,9 +97,9 @@ def coupled_lyapunov(model: ErrorModel, W: Array) -> Array | None:
 
     The sum converges if and only if the error system is mean-square stable.
     """
-    term, P0 = W, W.copy()
+    operator, term, P0 = Operator(model), W, W.copy()
     for _ in range(_MOST_STEPS):
-        term = corner(model, term)
+        term = operator.corner(term)
         if np.abs(term).max() > _GROWN * np.abs(W).max():
             return None
         if positive(W / 2.0 - term):
@@ -124,13 +123,6 @@ def plant_lyapunov(model: ErrorModel, P: Array) -> Array | None:
             return P0
         R0 = R0 + term
     return None
-
-
-def corner(model: ErrorModel, P: Array) -> Array:
-    """L_s(P) = A'P_bar A + sum alpha_i F_i'P_bar F_i for every mode s, (modes, n_eta, n_eta)."""
-    operator = Operator(model)
-    L = operator.corner(P)
-    return (L + L.swapaxes(1, 2)) / 2.0
 
 
 def relaxed(model: ErrorModel, P: Array, P0: Array, t: float) -> Array:

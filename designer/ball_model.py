@@ -1,7 +1,7 @@
 """The error model in ball arithmetic, built link by link from the numbers of the gains file as they stand.
 
 It shares no code with designer.error_model, and takes a_ij K_ij, beta(1 - beta) and A - sum of a_ij K_ij as exact
-products and sums of stored floats. In mode s (docs/theory.md derives it; it is (10)(11) of the paper where losses are
+products and sums of stored floats. In mode s (docs/theory.md, section 9; it is (10)(11) of the paper where losses are
 hidden and no link loses messages)
 
     eta+ = [A B][eta; w] + sum over l of xi_l E_l C_l [eta; w],
@@ -47,7 +47,7 @@ class BallModel:
 
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
         nx, n = problem.nx, problem.n
-        p = nx if problem.carries_plant else 0
+        p = problem.plant_states
         self.size, self.nw = p + n * nx, problem.nw
         self.x = list(range(p))
         self.e = [list(range(p + i * nx, p + (i + 1) * nx)) for i in range(n)]

@@ -5,6 +5,7 @@ With y = log g,
     J(K, H, y) = y - mu sum over steps and modes of log det (I - B'Y_bar B / g)
 
 is finite exactly where gamma_T^2 < g, and costs one sweep and one covariance: gamma_T itself is never searched for.
+B'Y_bar B is the block of w in `Operator.joint`; docs/theory.md, section 6.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Barrier:
         """The same with g held, and the size of the gains in place of y: -sum of log det + 10 |v|^2 / scale^2.
 
         The sum is least where the responses of all horizons together are small: for gains that decay fast. Without
-        the 10, gains of a flat minimum shrink so slowly that the search ends first (docs/theory.md has figures).
+        the 10, gains of a flat minimum shrink so slowly that the search ends first.
         """
 
         def J(v: Array) -> tuple[float, Array]:

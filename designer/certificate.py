@@ -120,7 +120,7 @@ def _text(failed: Finding, bits: int) -> str:
 def lyapunov_matrix(gains: Gains) -> Array:
     """P(s) over eta = [x; e_1; ...; e_n], or over e alone, from the stored certificate, (modes, n_eta, n_eta)."""
     problem, certificate = gains.problem, gains.certificate
-    nx, p = problem.nx, problem.nx if problem.carries_plant else 0
+    nx, p = problem.nx, problem.plant_states
     n_eta = p + problem.n * nx
     P = np.zeros((len(problem.mode_names), n_eta, n_eta))
     for s, mode in enumerate(problem.mode_names):

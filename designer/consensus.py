@@ -96,11 +96,9 @@ def least_variance_gains(problem: Problem) -> tuple[Array, Array]:
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
     occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
-    K_bar, H_bar = (
-        np.zeros((modes, problem.n * nx, problem.n * nx)),
-        np.zeros((modes, problem.n * nx, rows_total(problem))),
-    )
-    size = nx * (problem.n + (1 if problem.carries_plant else 0))
+    K_bar = np.zeros((modes, problem.n * nx, problem.n * nx))
+    H_bar = np.zeros((modes, problem.n * nx, rows_total(problem)))
+    size = problem.plant_states + problem.n * nx
     fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
     X = fresh
     joint = np.zeros((modes, size + problem.nw, size + problem.nw))
@@ -149,7 +147,7 @@ class _Regression(NamedTuple):
 
 
 def _regression(problem: Problem, s: int, i: int) -> _Regression:
-    nx, plant, p = problem.nx, problem.plant, problem.nx if problem.carries_plant else 0
+    nx, plant, p = problem.nx, problem.plant, problem.plant_states
     heard, at_w, eye = problem.neighbours(s, i), p + problem.n * problem.nx, np.eye(problem.nx)
     others = [j for j in heard if not problem.unbiased or j != i]
     K = {j: slice(k * nx, (k + 1) * nx) for k, j in enumerate(others)}

@@ -2,7 +2,7 @@
 
 gamma_T is not smooth where several modes and directions are critical at once, and at its minimum they are. So the
 minimum is approached from inside, along the path of the minima of designer.barrier's J while mu falls; J is smooth,
-and BFGS follows it. docs/theory.md, "Design", has what else was tried.
+and BFGS follows it. docs/theory.md, section 6, has what else was tried.
 
 The last word is the exact gain of the gains found. If it shows that the horizon T was too short, T is doubled. That
 is so for gains that are not mean-square stable too: gamma_T is finite for them, and the longer T is, the more it is

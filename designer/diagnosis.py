@@ -229,7 +229,7 @@ def _mode_by_mode(problem: Problem) -> Iterator[tuple[Problem, str]]:
 
 # warnings
 def _warned_plant(problem: Problem) -> Iterator[str]:
-    radius = float(np.abs(np.linalg.eigvals(problem.plant.A)).max())
+    radius = problem.plant.spectral_radius
     if problem.carries_plant and radius > _NEARLY_UNSTABLE:
         yield (
             f"plant: A is nearly unstable: its spectral radius is {radius:.9g}, above {_NEARLY_UNSTABLE}; "

@@ -5,7 +5,7 @@ eta = [x; e_1; ...; e_n]; it gives the same errors. Where gains are unbiased and
 eta = [e_1; ...; e_n]. `error_model` is the reduced one, and is used everywhere; `paper_error_model` is (10)(11) as
 printed.
 
-Chance enters in three ways, each with mean 0 and uncorrelated with the others (docs/theory.md derives it):
+Chance enters in three ways, each with mean 0 and uncorrelated with the others (docs/theory.md, section 9):
 theta_j - beta_j for every node, phi_ij - rho_ij for every lossy link, and the products of both.
 """
 
@@ -199,7 +199,7 @@ def link_gains(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[LinkMatric
 def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     """Eqs. (10)(11) with the reduced state: eta = [x; e_1; ...; e_n], or e alone where x drops out."""
     bar, plant, modes = stacks(problem), problem.plant, len(problem.topologies)
-    nx, n, p = problem.nx, problem.n, problem.nx if problem.carries_plant else 0
+    nx, n, p = problem.nx, problem.n, problem.plant_states
     rho = problem.delivery
     delivered = np.kron(rho, np.ones((nx, nx)))  # (n nx, n nx)
     H = H_bar * np.repeat(np.repeat(rho, nx, axis=0), [len(node.C) for node in problem.nodes], axis=1)

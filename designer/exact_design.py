@@ -1,7 +1,4 @@
-"""From a problem to gains designed for the exact gain, with a certificate of kind "exact"; and the ladder of any gains.
-
-The ladder: floor <= exact gain <= certified gamma <= Theorem 2's gamma, where that was computed.
-"""
+"""From a problem to gains designed for the exact gain, with a certificate of kind "exact"; and one for any gains."""
 
 from __future__ import annotations
 
@@ -150,7 +147,7 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
 
 
 def _advice(problem: Problem) -> str:
-    radius = float(np.abs(np.linalg.eigvals(problem.plant.A)).max())
+    radius = problem.plant.spectral_radius
     if radius < 1.0:
         return "try --method decomposed"
     return (

@@ -1,8 +1,9 @@
 """The exact gain of given gains: the least gamma of which sup_k E|z_tilde(k)|^2 <= gamma^2 E sum |w|^2 is true.
 
-w(k) may depend on the modes r(0..k) and on everything before step k, but not on theta(k) or on later modes; the
-initial mode is any, the initial error is 0. That is the class that Theorem 1 covers. docs/theory.md derives what
-is written here; the letters are those of eqs. (10)(11), and everything is scaled so that g stands for gamma^2.
+w(k) may depend on the modes r(0..k) and on everything before step k, but not on what gets lost in step k or on later
+modes; the initial mode is any, the initial error is 0. That is the class that Theorem 1 covers. docs/theory.md,
+sections 1 to 3, derives what is written here; the letters are those of eqs. (10)(11), and g stands for gamma^2.
+In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.joint`, chance within.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ def inwards(problem: Problem, solution: LmiSolution, t: float) -> LmiSolution:
 def idle(problem: Problem, solution: LmiSolution) -> Array:
     """c W of this module's first lines, (nx, nx); V is diagonal, in the units of the answer's Q."""
     A, B = problem.plant.A, problem.plant.B
-    blocks = problem.n + (1 if problem.carries_plant else 0)
+    blocks = problem.n + (1 if problem.plant_states else 0)
     V = np.diag(np.maximum(np.diagonal(solution.Q, axis1=-2, axis2=-1).mean(axis=(0, 1)), np.finfo(float).tiny))
     W, power = V, A
     for _ in range(_DOUBLINGS):

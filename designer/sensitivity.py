@@ -2,7 +2,8 @@
 
 By the envelope theorem the worst w = Gamma eta may be held fixed while a gain moves. What is left is linear: a
 covariance X of eta, started by covariances V of w that are put in at chosen steps and modes, carried forward by
-the closed loop, collects the derivative of sum trace(V (B'Y_bar B)); docs/theory.md, "The gradient".
+the closed loop, collects the derivative of sum trace(V (B'Y_bar B)); docs/theory.md, section 5. Here and in the
+docstrings B'Y_bar B, B'Y_bar A and A'Y_bar A are the blocks of `Operator.joint`, chance within.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Sweep(NamedTuple):
 
 
 def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
-    """Y <- A'Y_bar A + sum alpha_i F_i'Y_bar F_i + A'Y_bar B W^-1 B'Y_bar A; None where a W is not positive."""
+    """Y <- A'Y_bar A + A'Y_bar B W^-1 B'Y_bar A from M'M, W = g I - B'Y_bar B; None where a W is not positive."""
     Y, size, log_det = operator.MM, operator.size, 0.0
     shape = (horizon, len(Y))
     Y_bars = np.empty((*shape, size, size))
@@ -62,7 +63,7 @@ class Inputs:
     def __init__(self, problem: Problem) -> None:
         bar, nx = stacks(problem), problem.nx
         self.problem, self.bar, self.rho = problem, bar, problem.delivery
-        self.p = nx if problem.carries_plant else 0
+        self.p = problem.plant_states
         self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
         widths = [len(node.C) for node in problem.nodes]
         self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)

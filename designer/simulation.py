@@ -12,7 +12,8 @@ node, e_i = x - x_hat_i, as it follows from eqs. (1)-(5) with the losses and del
 e is not computed as x - x_hat: an unstable plant would leave nothing of it but the rounding of x. Where the gains are
 unbiased, the first bracket is 0; where also every loss is seen, x is not needed and stays 0.
 
-This shares no arithmetic with the error model of designer/error_model.py, nor with agent/filter.py.
+This shares no arithmetic with the error model of designer/error_model.py, nor with agent/filter.py. docs/theory.md,
+section 8, says what the ensemble can show and what not.
 """
 
 from __future__ import annotations
@@ -218,9 +219,7 @@ def _disturbance(gains: Gains, steps: int) -> Array | float:
     """What the problem says of w: all of it, or the deviation of white noise."""
     if isinstance(gains.problem.disturbance, White):
         return gains.problem.disturbance.deviation
-    source = DisturbanceSource(
-        gains.problem, seed=0, worst_case=gains.worst_case
-    )  # without chance, so any seed will do
+    source = DisturbanceSource(gains.problem, seed=0, worst_case=gains.worst_case)  # no chance in it: any seed will do
     return np.array([source.at(k) for k in range(steps)]).reshape(steps, -1)
 
 

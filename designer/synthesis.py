@@ -23,7 +23,6 @@ from designer.exact_design import design_exact, with_ladder
 from designer.inwards import inwards
 from designer.lmi import LmiSolution
 from designer.lmi.attempts import tried_further
-from designer.lmi.units import spectral_radius
 from designer.worst_case import with_worst_case
 
 
@@ -160,7 +159,7 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
 
     For an unstable plant the answer itself has something to spare: the LMI was solved with a margin.
     """
-    for t in STEPS_INWARDS if spectral_radius(problem) < 1.0 else (0.0,):
+    for t in STEPS_INWARDS if problem.plant.spectral_radius < 1.0 else (0.0,):
         moved = inwards(problem, solution, t) if t else solution
         K, H = _links(problem, moved)
         P = block_diagonal(moved.R, moved.Q)
@@ -183,15 +182,16 @@ def _links(problem: Problem, solution: LmiSolution) -> tuple[LinkMatrices, LinkM
 
 
 def _unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Unattainable:
+    advice = "; try the problem in other units, so that its numbers are near 1"
     return Unattainable(
         f"{solution.solver.name} says {solution.solver.status} with gamma {solution.gamma:.6g} for {problem.name}, "
         f"but the check without a solver does not confirm its answer ({why})"
-        + ("; try the problem in other units, so that its numbers are near 1" if spectral_radius(problem) < 1.0 else "")
+        + (advice if problem.plant.spectral_radius < 1.0 else "")
     )
 
 
 def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float) -> Certificate:
-    P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.nx if problem.carries_plant else 0
+    P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.plant_states
     modes, nodes = problem.mode_names, problem.node_names
     structured = confirmed.form == "structured"
     parts = [slice(p + i * nx, p + (i + 1) * nx) for i in range(problem.n)]

@@ -52,7 +52,8 @@ def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Distu
     """max over T <= horizon of lambda_max(E[G_T'G_T]), G_T from w(0..T-1) to z_tilde(T), from r(0) = initial.
 
     Block (j, l), j < l, of E[G_T'G_T] is E[eta_j(l)'A'Y_bar B], where eta_j is what w(j) left in the state, whose mean
-    in every mode moves by A alone (losses have mean 0), and Y = L^(T-1-l)(M'M) weighs what is left of it at T.
+    in every mode moves by A alone (chance has mean 0), and Y = L^(T-1-l)(M'M) weighs what is left of it at T; block
+    (l, l) is B'Y_bar B. Both are blocks of `Operator.joint`, chance within; docs/theory.md, section 7.
     """
     operator, nw, size = Operator(model), model.B.shape[2], model.A.shape[1]
     joints, Y = [], np.asarray(operator.MM)  # joints[m]: [A B]'Y_bar [A B] with m steps to go afterwards

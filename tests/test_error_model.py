@@ -10,7 +10,6 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.back_off import corner
 from designer.error_model import error_model, link_gains, paper_error_model, realised, stacks, step
 from designer.gain import Operator
 
@@ -148,7 +147,7 @@ def test_expectation_over_losses_is_the_enumeration_of_all_of_them(network: Netw
             eta_next = step(model, s, np.array(theta), eta, no_w)
             for t, pi_st in enumerate(problem.markov.transition[s]):
                 expected += chance * pi_st * (eta_next @ P[t] @ eta_next)
-        assert eta @ corner(model, P)[s] @ eta == pytest.approx(expected, rel=1e-10)
+        assert eta @ Operator(model).corner(P)[s] @ eta == pytest.approx(expected, rel=1e-10)
 
 
 # what is not in the paper

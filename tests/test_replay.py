@@ -146,7 +146,7 @@ def test_a_certificate_that_holds_is_said_to_hold(tmp_path: Path) -> None:
     assert (verdict.document()["certificate"], verdict.document()["certificate_failure"]) == (True, None)
     text = verdict.text()
     assert "certificate  holds" in text
-    assert "in the mean over modes and losses, from zero initial error; one run may exceed it" in text
+    assert "in the mean over modes, losses and deliveries, from zero initial error; one run may exceed it" in text
     assert "with gamma 0.34799" in text
 
 

@@ -35,14 +35,14 @@ class Solver(Model):
 class Certificate(Model):
     """What is proved: sup_k E ||z_tilde(k)||^2 <= gamma^2 sum_k ||w(k)||^2, from zero initial error.
 
-    The expectation is over modes and losses; one run may exceed it. P is over the reduced error state
-    eta = [x; e_1; ...; e_n], nodes in file order, of length nx (n + 1).
+    The expectation is over modes, losses and deliveries; one run may exceed it. P is over the reduced error state
+    eta = [x; e_1; ...; e_n], nodes in file order, or e alone where the errors do not depend on x.
     """
 
     gamma: Number = Field(gt=0.0)
     kind: Literal["lyapunov", "exact"]
     form: Literal["structured", "full"]
-    R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx)
+    R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx); None with e alone
     Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]
     P: dict[str, Matrix] | None = None  # full: P[mode]
     horizon: int | None = None  # of the exact gain
@@ -68,9 +68,7 @@ class Gains(Model):
     certificate: Certificate
     solver: Solver
     seconds: dict[str, Number]  # of each phase of the design, and "total"
-    worst_case: Matrix | None = (
-        None  # (steps, nw), energy 1: the worst w that is fixed beforehand, where it is asked for
-    )
+    worst_case: Matrix | None = None  # (steps, nw), energy 1: the worst fixed w, where the problem asks for it
 
     @classmethod
     def load(cls, path: Path) -> Self:

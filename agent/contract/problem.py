@@ -51,6 +51,11 @@ class Plant(Model):
             )
         return self
 
+    @property
+    def spectral_radius(self) -> float:
+        """Of A: below 1 where the plant is stable."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
 
 class Node(Model):
     """Eq. (2): y_i(k) = theta_i(k) C_i x(k) + D_i w(k). C_i: (ny_i, nx), D_i: (ny_i, nw).
@@ -256,6 +261,11 @@ class Problem(Model):
         """Whether the errors depend on x itself: not where the gains are unbiased and every loss is seen."""
         return not self.unbiased or bool(self._hidden())
 
+    @property
+    def plant_states(self) -> int:
+        """How many entries of eta are x: nx, or 0 where the errors do not depend on it."""
+        return self.nx if self.carries_plant else 0
+
     def _hidden(self) -> list[str]:
         """The nodes that lose measurements without knowing it."""
         return [node.name for node in self.nodes if node.arrival_probability < 1.0 and not node.seen]
@@ -354,7 +364,7 @@ class Problem(Model):
 
     @model_validator(mode="after")
     def _check_stability(self) -> Self:
-        radius = float(np.abs(np.linalg.eigvals(self.plant.A)).max())
+        radius = self.plant.spectral_radius
         if radius < 1.0 or not self.carries_plant:
             return self
         if self.unbiased:

@@ -38,7 +38,7 @@ from designer.lmi import LmiSolution, attempts, conic
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.cliques import clique_tree
 from designer.lmi.cones import Assembly, Cones, Indices, Inequality
-from designer.lmi.units import Units, natural_units, rescaled, spectral_radius
+from designer.lmi.units import Units, natural_units, rescaled
 
 Link = tuple[int, int]  # (i, j): node i hears node j
 MARGIN = 1e-6  # of the balance, for unstable plants: designer.inwards knows no way inwards there
@@ -128,7 +128,7 @@ def answers(problem: Problem, *, last_resort: bool = True) -> Iterator[LmiSoluti
 def _run(
     problem: Problem, solver: Callable[[Cones, Array], conic.Answer], units: Units
 ) -> tuple[Solver, LmiSolution | None]:
-    margin = 0.0 if spectral_radius(problem) < 1.0 else MARGIN
+    margin = 0.0 if problem.plant.spectral_radius < 1.0 else MARGIN
     lmi = assemble(rescaled(problem, units), margin=margin)
     q = np.zeros(lmi.cones.A.shape[1])
     q[lmi.delta] = 1.0
@@ -139,7 +139,7 @@ def _run(
 def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
     """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance."""
     build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
-    delta, R = build.unknown(1, 1), build.symmetric(nx if problem.carries_plant else 0)
+    delta, R = build.unknown(1, 1), build.symmetric(problem.plant_states)
     if problem.carries_plant:
         positive = build.inequality()  # R >= 0: the balance implies it for stable plants only
         x = positive.append(nx)

@@ -25,18 +25,13 @@ def natural_units(problem: Problem) -> Units:
 
     An unstable plant can be brought anywhere: its A is taken with less weight, as if its spectral radius were 0.95.
     """
-    radius = spectral_radius(problem)
+    radius = problem.plant.spectral_radius
     gramian, power = problem.plant.B @ problem.plant.B.T, problem.plant.A * (_DAMPED / radius if radius >= 1.0 else 1.0)
     for _ in range(_DOUBLINGS):
         gramian, power = gramian + power @ gramian @ power.T, power @ power
     reach = np.sqrt(np.diag(gramian))
     state = np.where(reach > 0.0, reach, 1.0)
     return Units(state, float(np.linalg.norm(problem.plant.M * state, 2)) or 1.0)
-
-
-def spectral_radius(problem: Problem) -> float:
-    """Of the plant's A: below 1 where the plant is stable."""
-    return float(np.abs(np.linalg.eigvals(problem.plant.A)).max())
 
 
 def rescaled(problem: Problem, units: Units) -> Problem:

@@ -71,7 +71,7 @@ def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> W
         for i in range(n):
             all_Y[i, i] = Q_bar[i] @ plant.A - sum(Y[i, j] for j in N[i] if j != i)
 
-    p = nx if problem.carries_plant else 0
+    p = problem.plant_states
     rows = np.eye(p + nw + n * nx)  # row k picks entry k of (x, w, e)
     x, w = rows[:p], rows[p : p + nw]
     e = [rows[p + nw + i * nx :][:nx] for i in range(n)]

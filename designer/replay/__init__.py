@@ -156,11 +156,8 @@ class PathAudit:
 def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float] | None:
     """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
     drawn = proofs.draw(log, central)
-    inputs, eta, hears = (
-        proofs.logged_inputs(log, central, drawn),
-        proofs.logged_states(log, central),
-        proofs.to_be_heard(log, central, drawn),
-    )
+    inputs, eta = proofs.logged_inputs(log, central, drawn), proofs.logged_states(log, central)
+    hears = proofs.to_be_heard(log, central, drawn)
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
         now = slice(first, min(first + _STEPS_AT_ONCE, log.steps))

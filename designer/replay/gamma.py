@@ -22,8 +22,8 @@ class Gamma:
         if self.failure is not None:
             return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
         return (
-            "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes and "
-            "losses, from zero initial error; one run may exceed it"
+            "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes, losses "
+            "and deliveries, from zero initial error; one run may exceed it"
         )
 
 

@@ -10,7 +10,10 @@ from designer.replay.census import Faults
 from designer.replay.gamma import Gamma
 
 CLAIMS = {  # what each proof shows, and what is counted
-    1: ("plant, sensors, the seed's modes, losses and disturbance, and what each node says of itself agree", "values"),
+    1: (
+        "plant, sensors, the seed's modes, losses, deliveries and disturbance, and what each node says of itself agree",
+        "values",
+    ),
     2: ("one step of the centralised model from the logged state gives the next logged state", "values"),
     3: ("the centralised model running freely from step 0 stays with the log", "values"),
     4: ("every message is there once", "messages"),
