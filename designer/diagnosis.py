@@ -8,7 +8,7 @@ on, the innovations of S are 0, the differences between its estimates are 0, and
 E|e_i(k)|^2 >= (q |lambda|^2)^k |v|^2, whatever the gains: q |lambda|^2 < 1 is necessary for mean-square stability.
 q = 1 is a node that is blind for ever. It has to hold in every class of modes that is never left, since gamma is for
 any initial mode. That it does not hold is proved here without a solver; where it holds, and no design was found all
-the same, parts of the problem are relaxed in turn to see which of them is in the way.
+the same, parts of the problem are relaxed in turn to see which of them is in the way. docs/theory.md, section 10.
 """
 
 from __future__ import annotations
