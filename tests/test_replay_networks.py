@@ -13,7 +13,8 @@ from made_recordings import Sent, observer_gains, random_gains, random_problem, 
 
 from agent.contract import schedule
 from agent.contract.problem import Problem
-from designer.replay import free_run, proofs, replay, tolerance
+from designer.replay import free_run, inputs, replay, tolerance
+from designer.replay.central import Central
 from designer.replay.log import load
 from designer.replay.verdict import Verdict
 
@@ -95,7 +96,7 @@ def test_an_unstable_plant_is_followed_for_as_long_as_it_runs(tmp_path: Path) ->
     assert states[-1] > 10.0 * max(states[:100])
     assert verdict.peak.size < 10.0 * replay(record(tmp_path / "begin.mcap", GAINS, TRUE, steps=STEPS)).peak.size  # type: ignore[union-attr]
     log = load(path)
-    central = proofs.Central.of(log.gains)
+    central = Central.of(log.gains)
     assert (central.model.plant_states, log.x.shape[1]) == (0, 2)  # the model has errors alone, the log has x
 
 
@@ -158,10 +159,10 @@ def test_the_path_gain_is_that_of_what_was_lost(tmp_path: Path) -> None:
     responses = np.array(columns).transpose(1, 2, 0)  # (steps, n, steps nw)
     expected = [np.linalg.norm(response, 2) for response in responses]
     log = load(record(tmp_path / "run.mcap", gains, sent, steps=steps))
-    central = proofs.Central.of(log.gains)
-    drawn = proofs.draw(log, central)
-    inputs = free_run.complete(proofs.logged_inputs(log, central, drawn), drawn, log, central)
-    (block,) = free_run.free_run(log, central, inputs, block=steps)
+    central = Central.of(log.gains)
+    drawn = inputs.draw(log, central)
+    complete = free_run.complete(inputs.logged_inputs(log, central, drawn), drawn, log, central)
+    (block,) = free_run.free_run(log, central, complete, block=steps)
     np.testing.assert_allclose(block.path, expected, rtol=1e-9)
 
 

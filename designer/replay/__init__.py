@@ -24,9 +24,11 @@ import numpy as np
 
 from agent.contract.problem import Problem
 from designer.replay import free_run, proofs
+from designer.replay.central import Central
 from designer.replay.gamma import checked_gamma
+from designer.replay.inputs import draw, logged_inputs, logged_states
 from designer.replay.log import Log, load
-from designer.replay.proofs import Central, Check
+from designer.replay.proofs import Check
 from designer.replay.verdict import Divergence, Peak, Proof, Verdict
 
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
@@ -155,8 +157,8 @@ class PathAudit:
 
 def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float] | None:
     """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
-    drawn = proofs.draw(log, central)
-    inputs, eta = proofs.logged_inputs(log, central, drawn), proofs.logged_states(log, central)
+    drawn = draw(log, central)
+    inputs, eta = logged_inputs(log, central, drawn), logged_states(log, central)
     hears = proofs.to_be_heard(log, central, drawn)
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):

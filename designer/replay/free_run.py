@@ -10,8 +10,10 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.error_model import realised
+from designer.replay.central import FLOOR, Central, Flags
+from designer.replay.inputs import Drawn, Inputs, logged_plant
 from designer.replay.log import Log
-from designer.replay.proofs import FLOOR, Central, Check, Drawn, Flags, Inputs, logged_plant, numbers
+from designer.replay.proofs import Check, numbers
 
 
 class Realised(NamedTuple):

@@ -6,26 +6,18 @@ All steps of a block are compared at once; every comparison is a `Check` with a 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agent.contract import schedule
 from agent.contract.arrays import Array
-from agent.contract.gains import Gains
-from agent.contract.problem import Problem
-from designer.error_model import ErrorModel, Stacks, error_model, measurement_slices, stacked_gains, stacks
+from designer.error_model import measurement_slices
+from designer.replay.central import FLOOR, Central, Flags
+from designer.replay.inputs import Drawn, Inputs, logged_plant
 from designer.replay.log import Log
 from designer.replay.topics import Numbers
 
-FLOOR = 1e-140  # magnitudes below it count as this: their squares underflow in the free run's bound
 MEASURED = ("[]", "numbers")  # what a measurement of a node that sees its losses is
-
-Flags = NDArray[np.bool_]
 
 
 class Check(NamedTuple):
@@ -56,177 +48,6 @@ def names(field: str, first: int, owner: Numbers, logged: Numbers, expected: Num
     unknown = (logged < 0) | (expected < 0)
     gap = np.where(unknown, np.nan, logged != expected)
     return Check(1, field, first, owner, gap, logged.astype(float), expected.astype(float), words)
-
-
-@dataclass(frozen=True, eq=False)
-class Central:
-    """The centralised model (10)(11) of a gains file, and the absolute values that bound its rounding errors."""
-
-    problem: Problem
-    model: ErrorModel
-    bar: Stacks
-    K_bar: Array  # (modes, n nx, n nx)
-    H_bar: Array  # (modes, n nx, sum ny)
-
-    @classmethod
-    def of(cls, gains: Gains) -> Central:
-        K_bar, H_bar = stacked_gains(gains)
-        return cls(gains.problem, error_model(gains.problem, K_bar, H_bar), stacks(gains.problem), K_bar, H_bar)
-
-    @cached_property
-    def C_nu(self) -> Array:
-        """(sum ny, n nx): what x_hat takes off a measurement: beta_i C_i, or C_i where node i sees its losses."""
-        seen = np.array([node.seen for node in self.problem.nodes])[self.y_owner]
-        return np.asarray(np.where(seen[:, None], self.bar.C, self.bar.C_beta))
-
-    @cached_property
-    def links(self) -> tuple[Numbers, Numbers]:
-        """Receivers and senders of the lossy links, in the order of the problem."""
-        index, links = self.problem.node_names.index, self.problem.links or ()
-        ends = np.array([(index(link.receiver), index(link.sender)) for link in links], dtype=np.int64).reshape(-1, 2)
-        return ends[:, 0], ends[:, 1]
-
-    def delivered(self, phi: Flags) -> Flags | None:
-        """(n, n) from the values of the lossy links, (links,); None where there are none."""
-        if not len(phi):
-            return None
-        delivered = np.ones((self.problem.n, self.problem.n), dtype=bool)
-        delivered[self.links] = phi
-        return delivered
-
-    @cached_property
-    def stand_in(self) -> Array | None:
-        """(modes, n, nx, nx): in absolute values, by what a node multiplies its own estimate beside a_ii K_ii.
-
-        a_ij |K_ij| of the lossy links, where it stands in for a message; where gains are unbiased |A| and a_ij |K_ij|
-        of all neighbours. None where there is nothing of the kind.
-        """
-        problem, n, nx = self.problem, self.problem.n, self.problem.nx
-        counts = np.ones((n, n)) if problem.unbiased else (problem.delivery < 1.0).astype(float)
-        np.fill_diagonal(counts, 0.0)
-        if not problem.unbiased and not counts.any():
-            return None
-        blocks = np.abs(self.K_bar).reshape(-1, n, nx, n, nx)
-        of_others = np.einsum("sirjc,ij->sirc", blocks, counts)
-        return np.asarray(of_others + (np.abs(problem.plant.A) if problem.unbiased else 0.0))
-
-    @cached_property
-    def touches(self) -> Array:
-        """(modes, n_eta, n_eta): 1 where an entry of eta(k) may enter one of eta(k+1), else 0."""
-        model, p = self.model, self.model.plant_states
-        touches = model.A != 0.0
-        touches[:, p:] |= np.abs(model.H) @ np.abs(model.R[:, : model.size]) != 0.0
-        links = model.links
-        if links is not None:
-            nx = self.problem.nx
-            for s, i, columns, V_l in zip(links.mode, links.receiver, links.columns, links.V, strict=True):
-                rows, here = touches[s, p + i * nx : p + (i + 1) * nx], columns < model.size
-                rows[:, columns[here]] |= V_l[:, here] != 0.0
-        return np.asarray(touches, dtype=np.float64)
-
-    def owner(self, width: int) -> Numbers:
-        """The node of each column of a stacked vector with `width` numbers for each node."""
-        return np.repeat(np.arange(self.problem.n), width)
-
-    @property
-    def y_owner(self) -> Numbers:
-        return np.repeat(np.arange(self.problem.n), [node.C.shape[0] for node in self.problem.nodes])
-
-    def magnitude(self, s: int, x: Array, x_hat: Array, w: Array, y: Array) -> Array:
-        """What adds up to eta(k+1) in mode s at most, in absolute values, (steps, n_eta).
-
-        For x: |A||x| + |B||w|. For e_i, that and, over the neighbours j, a_ij |K_ij| (|x| + |x_hat_j|)
-        + a_ij |H_ij| (|y_j| + |C_j| (|x| + |x_hat_j|) + |D_j||w|), and `stand_in` times |x| + |x_hat_i|: an upper bound
-        both of what the node adds up in its step and of what (10) adds up, up to the factor that `tolerance` derives,
-        because |e_j| <= |x| + |x_hat_j|.
-        """
-        x, x_hat, w, y = (np.nan_to_num(np.abs(values)) for values in (x, x_hat, w, y))
-        plant, n = self.problem.plant, self.problem.n
-        of_x = x @ np.abs(plant.A).T + w @ np.abs(plant.B).T
-        reach = np.tile(x, n) + x_hat
-        of_y = y + reach @ np.abs(self.bar.C).T + w @ np.abs(self.bar.D).T
-        of_e = np.tile(of_x, n) + reach @ np.abs(self.K_bar[s]).T + of_y @ np.abs(self.H_bar[s]).T
-        if self.stand_in is not None:
-            own = reach.reshape(-1, n, self.problem.nx)
-            of_e += np.einsum("kic,irc->kir", own, self.stand_in[s]).reshape(of_e.shape)
-        return np.asarray(np.maximum(np.hstack([of_x, of_e]) if self.model.plant_states else of_e, FLOOR))
-
-
-class Inputs(NamedTuple):
-    """What drives the model. With a simulated plant: modes, theta, w, phi, and u = 0.
-
-    Without one the errors are unknown, and estimates are compared instead: with x = 0, w = 0 and e_i = -x_hat_i,
-    (8) reads e(k+1) = (K_bar - H_bar C_bar_beta) e(k) - H_bar u(k), where u is the logged y. Where a node sees its
-    losses u is 0 for what did not arrive, and theta says what did; of hidden losses theta counts as beta.
-    """
-
-    mode: Numbers  # (steps,)
-    theta: Array  # (steps, n)
-    w: Array  # (steps, nw)
-    u: Array  # (steps, sum ny)
-    phi: Flags  # (steps, links): which messages were used, of the lossy links alone
-
-
-class Drawn(NamedTuple):
-    """What the run's seed gives."""
-
-    mode: Numbers  # (steps,)
-    theta: Array  # (steps, n)
-    w: Array  # (steps, nw)
-    phi: Flags  # (steps, links)
-
-
-def draw(log: Log, central: Central) -> Drawn:
-    problem, steps = log.gains.problem, log.steps
-    losses = schedule.Losses(problem, seed=log.seed)
-    disturbance = schedule.DisturbanceSource(problem, seed=log.seed, worst_case=log.gains.worst_case)
-    return Drawn(
-        np.fromiter(islice(schedule.modes(problem, seed=log.seed), steps), dtype=np.int64, count=steps),
-        np.array([losses.at(k) for k in range(steps)]).reshape(steps, problem.n),
-        np.array([disturbance.at(k) for k in range(steps)]).reshape(steps, problem.nw),
-        _drawn_deliveries(log, central),
-    )
-
-
-def _drawn_deliveries(log: Log, central: Central) -> Flags:
-    drawn = np.empty((log.steps, len(central.links[0])), dtype=bool)
-    if drawn.size:
-        deliveries = schedule.Deliveries(log.gains.problem, seed=log.seed)
-        drawn[:] = [deliveries.at(k)[central.links] for k in range(log.steps)]
-    return drawn
-
-
-def logged_inputs(log: Log, central: Central, drawn: Drawn) -> Inputs:
-    """The inputs as logged, NaN and -1 where missing; phi as drawn where it is not logged."""
-    phi = _used_messages(log, central, drawn)
-    if log.has_plant:
-        return Inputs(log.mode, log.theta, log.w, np.zeros_like(log.y), phi)
-    problem = log.gains.problem
-    theta = np.where([node.seen for node in problem.nodes], log.measured, problem.beta)
-    u = np.where(log.measured[:, central.y_owner] == 0.0, 0.0, log.y)
-    return Inputs(log.mode, theta, np.zeros((log.steps, problem.nw)), u, phi)
-
-
-def _used_messages(log: Log, central: Central, drawn: Drawn) -> Flags:
-    """phi of step k, (steps, links), by `heard` in the receiver's estimate of step k + 1; as drawn where that lacks."""
-    receivers, senders = central.links
-    if not len(receivers):
-        return drawn.phi
-    told = log.heard[1:, receivers]
-    used = np.vstack([log.senders.members(), np.zeros((1, log.gains.problem.n), dtype=bool)])[told, senders]
-    return np.vstack([np.where(told >= 0, used, drawn.phi[:-1]), drawn.phi[-1:]])
-
-
-def logged_plant(log: Log) -> Array:
-    """x(k) as logged, (steps, nx); 0 where there is no simulated plant."""
-    return log.x if log.has_plant else np.zeros_like(log.x)
-
-
-def logged_states(log: Log, central: Central) -> Array:
-    """eta(k) as logged, (steps, n_eta): [x; e_1; ...; e_n], or the errors alone where x drops out."""
-    x = logged_plant(log)
-    errors = np.tile(x, log.gains.problem.n) - log.x_hat
-    return np.hstack([x, errors]) if central.model.plant_states else errors
 
 
 def start_checks(log: Log, central: Central) -> Iterator[Check]:
