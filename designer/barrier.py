@@ -17,13 +17,11 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer import bfgs
-from designer.error_model import ErrorModel, error_model, measurement_slices, rows_total
+from designer.error_model import ErrorModel, StackedGains, error_model, measurement_slices, rows_total
 from designer.gain import Operator
 from designer.sensitivity import Inputs, slope, sweep
 
 _RIDGE = math.sqrt(10.0)
-
-StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny)
 
 
 class Entries:

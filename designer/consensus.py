@@ -18,9 +18,10 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.error_model import error_model, measurement_slices, rows_total
+from designer.error_model import StackedGains, error_model, measurement_slices, rows_total
 from designer.gain import Operator
 
+WEIGHT = 0.4  # of the neighbours' estimates together
 _MOST_STEPS = 1000
 _STEPS_OF_NETWORK = 300
 _SETTLED_NETWORK = 1e-6
@@ -29,8 +30,8 @@ _STIRRED = 1e-4  # white noise on every error, beside w: so that no direction go
 _BOUNDLESS = 1e100
 
 
-def consensus_gains(problem: Problem, *, weight: float) -> tuple[Array, Array]:
-    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny); the neighbours' estimates share `weight`.
+def consensus_gains(problem: Problem, *, weight: float = WEIGHT) -> StackedGains:
+    """Kalman-consensus gains; the neighbours' estimates share `weight`.
 
     The blocks of each row of K_bar, a_ij K_ij, sum to A: the gains are unbiased.
     """
@@ -89,8 +90,8 @@ def _plant_covariance(problem: Problem) -> Array:
     return np.asarray(X)
 
 
-def least_variance_gains(problem: Problem) -> tuple[Array, Array]:
-    """K_bar and H_bar at which white w leaves each node the least mean square of e_i, given the others' gains."""
+def least_variance_gains(problem: Problem) -> StackedGains:
+    """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
     modes, nx, columns = len(problem.topologies), problem.nx, measurement_slices(problem)
     regressions = {(s, i): _regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes

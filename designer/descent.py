@@ -21,8 +21,8 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer import bfgs
-from designer.barrier import Barrier, StackedGains
-from designer.error_model import error_model
+from designer.barrier import Barrier
+from designer.error_model import StackedGains, error_model
 from designer.gain import Gain, exact_gain, horizon_gain
 
 _COARSE = (3e-2, 9e-3, 3e-3, 9e-4)  # mu: enough to see which start leads lowest

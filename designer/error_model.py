@@ -23,6 +23,7 @@ from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 
 Indices = NDArray[np.intp]
+StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) of (8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +160,12 @@ def rows_total(problem: Problem) -> int:
     return sum(node.C.shape[0] for node in problem.nodes)
 
 
-def stacked_gains(gains: Gains) -> tuple[Array, Array]:
-    """K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) of (8): blocks a_ij K_ij and a_ij H_ij."""
+def stacked_gains(gains: Gains) -> StackedGains:
+    """K_bar and H_bar of (8): blocks a_ij K_ij and a_ij H_ij."""
     return stacked_links(gains.problem, gains.K, gains.H)
 
 
-def stacked_links(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> tuple[Array, Array]:
+def stacked_links(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> StackedGains:
     """`stacked_gains` of gains that are in no file yet."""
     nx, columns = problem.nx, measurement_slices(problem)
     K_bar = np.zeros((len(problem.topologies), problem.n * nx, problem.n * nx))

@@ -12,16 +12,14 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.barrier import StackedGains
 from designer.certificate import Verdict
-from designer.consensus import consensus_gains, least_variance_gains
+from designer.consensus import WEIGHT, consensus_gains, least_variance_gains
 from designer.descent import Descent, Progress, descend
-from designer.error_model import error_model, link_gains, stacked_links
+from designer.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.exact_certificate import check_exact
 from designer.floor import floor
 from designer.gain import Gain, exact_gain
 
-_CONSENSUS_WEIGHT = 0.4
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
@@ -100,7 +98,7 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
     starts = {
         "least variance": least_variance_gains(problem),
-        f"consensus {_CONSENSUS_WEIGHT}": consensus_gains(problem, weight=_CONSENSUS_WEIGHT),
+        f"consensus {WEIGHT}": consensus_gains(problem),
     }
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None

@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.barrier import StackedGains
 from designer.consensus import consensus_gains, least_variance_gains
+from designer.error_model import StackedGains
 from designer.exact_design import exact_bounds
 from designer.floor import floor
 from designer.problems import find
 
 PRINTED = {"zhu2020-ideal": 0.23, "zhu2020-lossy": 0.36}  # gamma of examples 1 and 2
 EXAMPLES = tuple(PRINTED)
-_CONSENSUS_WEIGHT = 0.4
 _SCS_ITERATIONS = 4000
 
 
@@ -45,11 +44,11 @@ class Computed:
     def scs(self) -> float | None:
         from designer.lmi import theorem2
 
-        return theorem2.said_by("SCS", self.problem, iterations=_SCS_ITERATIONS).gamma
+        return theorem2.gamma_by_scs(self.problem, iterations=_SCS_ITERATIONS)
 
     @cached_property
     def consensus(self) -> float | None:
-        return self._exact_of(consensus_gains(self.problem, weight=_CONSENSUS_WEIGHT))
+        return self._exact_of(consensus_gains(self.problem))
 
     @cached_property
     def least_variance(self) -> float | None:

@@ -18,10 +18,9 @@ from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.back_off import least_gamma
-from designer.barrier import StackedGains
 from designer.certificate import lyapunov_matrix
 from designer.effort import default_method
-from designer.error_model import error_model, stacked_gains, stacked_links
+from designer.error_model import StackedGains, error_model, stacked_gains, stacked_links
 from designer.gain import exact_gain
 from designer.ladder import percent
 from designer.workers import each

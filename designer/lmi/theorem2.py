@@ -79,27 +79,14 @@ def _attempt(problem: Problem, solver: str, units: Units, reduced: bool) -> tupl
     return record, _solution(lmi, units, record, reduced=reduced) if record.status in SOLVED else None
 
 
-class Said(NamedTuple):
-    """What one solver says of (42); gamma is None where it has no answer."""
-
-    gamma: float | None
-    status: str
-    iterations: int
-    seconds: float
-
-
-def said_by(solver: str, problem: Problem, *, iterations: int) -> Said:
-    """(36)(37) as printed, on rescaled data, by one solver that may stop after so many iterations; for comparison."""
-    if solver not in cp.installed_solvers():
-        return Said(None, "not installed", 0, 0.0)
+def gamma_by_scs(problem: Problem, *, iterations: int) -> float | None:
+    """gamma of (42) as printed, on rescaled data, by SCS stopped after so many iterations at most; None: no answer."""
+    if cp.SCS not in cp.installed_solvers():
+        return None
     units = natural_units(problem)
     lmi = theorem2(rescaled(problem, units))
-    limit = {"max_iters": iterations} if solver == cp.SCS else {"max_iter": iterations}
-    record = _run(lmi.problem, solver, limit)
-    if record.status not in SOLVED:
-        return Said(None, record.status, 0, record.seconds)
-    gamma = units.output * math.sqrt(max(float(lmi.delta.value), 0.0))
-    return Said(gamma, record.status, record.iterations, record.seconds)
+    record = _run(lmi.problem, cp.SCS, {"max_iters": iterations})
+    return units.output * math.sqrt(max(float(lmi.delta.value), 0.0)) if record.status in SOLVED else None
 
 
 def theorem2(problem: Problem, *, reduced: bool = False) -> Lmi:
