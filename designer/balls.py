@@ -109,6 +109,8 @@ def _sign(S: arb_mat, sizes: Array) -> Sign:
     order = G.nrows()
     diagonal = [G[i, i] for i in range(order)]
     least = min(float(entry) for entry in diagonal)
+    if not np.isfinite(least):
+        return UNDECIDED
     if not least > 0.0:
         return Sign(proved=False, refuted=any(entry < 0 for entry in diagonal), least=least)
     d = exact(np.array([[float(entry) ** -0.5] for entry in diagonal]))

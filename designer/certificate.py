@@ -16,12 +16,13 @@ from flint import arb, arb_mat, ctx
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, listed
-from agent.contract.gains import Gains, LinkMatrices
+from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.ball_model import BallModel
 from designer.balls import Sign, add, exact, floats, identity, sign
 
 BITS = (128, 256, 512, 1024)  # carried one after the other, until every inequality is proved or one proved false
+MOST_STEPS = 1_000_000  # of a recursion that is proved; designs need fewer even where errors hardly decay
 
 
 class Verdict(NamedTuple):
@@ -48,7 +49,7 @@ class Finding(NamedTuple):
 
 
 def verify(gains: Gains) -> Verdict:
-    """Prove what the gains file claims, from everything as it stands in it."""
+    """Prove what the gains file claims, from everything as it stands in it. InputError: there is none to be read."""
     proved, P = gains.certificate, lyapunov_matrix(gains)
     if proved.kind == "lyapunov":
         return check(gains.problem, gains.K, gains.H, P=P, gamma=proved.gamma)
@@ -56,6 +57,8 @@ def verify(gains: Gains) -> Verdict:
 
     if proved.horizon is None or proved.horizon < 1:
         raise InputError(f'certificate: horizon is {proved.horizon}; kind "exact" needs the number of its steps')
+    if proved.horizon > MOST_STEPS:
+        raise InputError(f"certificate: horizon is {proved.horizon}; a proof takes at most {MOST_STEPS} steps")
     return check_exact(gains.problem, gains.K, gains.H, P=P, gamma=proved.gamma, horizon=proved.horizon)
 
 
@@ -120,6 +123,7 @@ def _text(failed: Finding, bits: int) -> str:
 def lyapunov_matrix(gains: Gains) -> Array:
     """P(s) over eta = [x; e_1; ...; e_n], or over e alone, from the stored certificate, (modes, n_eta, n_eta)."""
     problem, certificate = gains.problem, gains.certificate
+    _refuse_other_matrices(problem, certificate)
     nx, p = problem.nx, problem.plant_states
     n_eta = p + problem.n * nx
     P = np.zeros((len(problem.mode_names), n_eta, n_eta))
@@ -133,6 +137,24 @@ def lyapunov_matrix(gains: Gains) -> Array:
             rows = slice(p + i * nx, p + (i + 1) * nx)
             P[s, rows, rows] = _stored((certificate.Q or {}).get(mode, {}), node, f"Q of mode {mode}", nx)
     return P
+
+
+def _refuse_other_matrices(problem: Problem, certificate: Certificate) -> None:
+    """A matrix that the proof would not use is refused: whoever wrote it meant something by it."""
+    modes, nodes, needed = problem.mode_names, problem.node_names, {"P"}
+    if certificate.form == "structured":
+        needed = {"R", "Q"} if problem.carries_plant else {"Q"}
+    for letter, matrices in (("R", certificate.R), ("Q", certificate.Q), ("P", certificate.P)):
+        if matrices is not None and letter not in needed:
+            raise InputError(
+                f'certificate: form "{certificate.form}" has {listed(sorted(needed))} for these errors, and no {letter}'
+            )
+    parts = [("P", "mode", certificate.P, modes), ("Q", "mode", certificate.Q, modes)]
+    parts += [(f"Q of mode {mode}", "node", of_mode, nodes) for mode, of_mode in (certificate.Q or {}).items()]
+    for what, kind, matrices, names in parts:
+        for name in matrices or ():
+            if name not in names:
+                raise InputError(f'certificate: {what}: {kind} "{name}" does not exist; there are {listed(names)}')
 
 
 def _stored(matrices: dict[str, Array], name: str, what: str, size: int) -> Array:

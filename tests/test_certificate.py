@@ -20,7 +20,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer import balls, certificate
+from designer import balls, certificate, exact_certificate
 from designer.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.ball_model import BallModel, Noise, Sensor
 from designer.balls import above, below, exact, floats, sign
@@ -271,6 +271,90 @@ def test_a_certificate_without_its_matrices_is_malformed_input() -> None:
         verify(mutated(golden, lambda document: document["certificate"]["Q"]["2"].pop("3")))
     with pytest.raises(InputError, match="it must be 2 x 2"):
         verify(mutated(golden, lambda document: document["certificate"].update(R=[[1.0]])))
+
+
+@pytest.mark.parametrize(
+    ("certificate", "why"),
+    [
+        ({"horizon": 10**9}, "horizon is 1000000000; a proof takes at most 1000000 steps"),
+        ({"horizon": -3}, "horizon is -3"),
+        ({"R": [[1.0, 0.0], [0.0, 1.0]]}, 'form "full" has "P" for these errors, and no R'),
+        ({"form": "structured"}, 'form "structured" has "Q" and "R" for these errors, and no P'),
+        ({"P": {"1": [[1.0]]}}, "it must be 10 x 10"),
+        ({"P": {}}, 'P of mode 1 lacks "1"; there is nothing'),
+    ],
+)
+def test_a_certificate_that_no_proof_can_be_read_from_is_refused(certificate: Document, why: str) -> None:
+    """At once, in one sentence: a horizon that would take for ever, and matrices of the other form."""
+    with pytest.raises(InputError, match=why):
+        verify(mutated(ALL["paper", "exact"], lambda document: document["certificate"].update(certificate)))
+
+
+def test_matrices_that_the_proof_would_not_use_are_refused() -> None:
+    """Of modes and nodes that do not exist; an R where the errors do not contain x."""
+    golden = Gains.load(GOLDEN)
+    with pytest.raises(InputError, match='Q of mode 2: node "9" does not exist; there are "1", "2", "3" and "4"'):
+        verify(mutated(golden, lambda document: document["certificate"]["Q"]["2"].update({"9": [[1.0]]})))
+    for part, edit in (("Q", {"9": {}}), ("P", {"9": [[1.0]]})):
+        gains = golden if part == "Q" else ALL["paper", "exact"]
+        with pytest.raises(InputError, match=f'{part}: mode "9" does not exist'):
+            verify(mutated(gains, lambda document, part=part, edit=edit: document["certificate"][part].update(edit)))  # type: ignore[misc]
+    structured = {"form": "structured", "P": None, "Q": {}, "R": [[1.0]]}
+    with pytest.raises(InputError, match='form "structured" has "Q" for these errors, and no R'):
+        verify(mutated(ALL["unbiased", "exact"], lambda document: document["certificate"].update(structured)))
+
+
+@pytest.mark.parametrize("horizon", ["60", 60.0, True])
+def test_a_horizon_is_a_whole_number(horizon: object) -> None:
+    document = ALL["paper", "exact"].document()
+    document["certificate"]["horizon"] = horizon
+    with pytest.raises(InputError, match="certificate: horizon: must be a whole number"):
+        Gains.from_bytes(json.dumps(document).encode(), source="memory")
+
+
+@pytest.mark.parametrize("network", ["real", "unbiased"])
+def test_with_few_bits_nothing_false_is_proved_and_nothing_true_is_proved_false(
+    network: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every rounding is to the safe side, although over a whole horizon few bits lose more than gamma is off."""
+    gains = ALL[network, "exact"]
+    assert gains.certificate.exact is not None
+    low = gains.certificate.exact[0] * (1.0 - 1e-8)
+    false = gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"gamma": low})})
+    for bits in (26, 28):
+        monkeypatch.setattr(certificate, "BITS", (bits,))
+        assert not verify(false).holds
+        assert "it is false" not in str(verify(gains).failure)
+
+
+def test_a_tail_that_floats_find_too_small_is_proved_false(monkeypatch: pytest.MonkeyPatch) -> None:
+    """tau^2 is found by floats; the proof does not rest on it."""
+    found = exact_certificate._relative
+    monkeypatch.setattr(exact_certificate, "_relative", lambda Z, P: 0.99 * found(Z, P))
+    verdict = verify(ALL["real", "exact"])
+    assert verdict.failure is not None
+    assert verdict.failure.startswith("tail fails")
+    assert "it is false" in verdict.failure
+
+
+def test_only_the_symmetric_part_of_P_counts() -> None:
+    """x'Px does not see the rest."""
+    gains = ALL["real", "lyapunov"]
+    P = lyapunov_matrix(gains)
+    skew = np.abs(P).max() * np.triu(np.ones_like(P), 1)
+    verdict = check(gains.problem, gains.K, gains.H, P=P + skew - skew.swapaxes(1, 2), gamma=gains.certificate.gamma)
+    assert verdict.holds
+    assert verdict.margins == pytest.approx(verify(gains).margins, rel=1e-3)
+
+
+def test_rows_of_the_chain_are_divided_by_their_sums() -> None:
+    """A row may miss 1 by 1e-9, and then stands for the one that does not."""
+    document = find("two-nodes").document()
+    document["markov"]["transition"] = [[1.0 - 9e-10]]
+    problem = Problem.from_document(document)
+    zero = np.zeros((1, 2, 2))
+    (row,) = BallModel(problem, *link_gains(problem, zero, zero)).transition
+    assert float(abs(sum(row) - 1)) < 1e-30
 
 
 # the checker has teeth: with a part of the model taken away, what is false passes
@@ -541,10 +625,17 @@ def test_the_command_says_what_is_proved_and_in_which_arithmetic(
     """Both kinds; with --json the keys that other tools rely on."""
     for kind, proved in (("lyapunov", "(17) and (18) of Theorem 1"), ("exact", "the recursion of the exact gain")):
         path = tmp_path / f"{kind}.json"
-        ALL["paper", kind].save(path)  # type: ignore[index]
+        gains = ALL["paper", kind]  # type: ignore[index]
+        gains.save(path)
         assert main(["verify", str(path)]) == EXIT_GOOD
         out = capsys.readouterr().out
-        for part in ("holds: gamma = ", "mean-square stability", proved, "ball arithmetic of 128 bits", " s\n"):
+        for part in (
+            f"holds: gamma = {gains.certificate.gamma} is proved",
+            "mean-square stability",
+            proved,
+            "ball arithmetic of 128 bits",
+            " s\n",
+        ):
             assert part in out
     false = tmp_path / "false.json"
     mutated(ALL["paper", "exact"], lower_gamma).save(false)

@@ -45,7 +45,7 @@ class Certificate(Model):
     R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx); None with e alone
     Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]
     P: dict[str, Matrix] | None = None  # full: P[mode]
-    horizon: int | None = None  # of the exact gain
+    horizon: int | None = Field(default=None, strict=True)  # of the exact gain
     lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
     lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
