@@ -25,7 +25,7 @@ from designer.exact_design import certify
 from designer.floor import floor
 from designer.gain import exact_gain
 from designer.ladder import Ladder
-from designer.worst_case import worst_disturbance, worst_policy
+from designer.worst_case import with_worst_case, worst_disturbance, worst_policy
 
 _MOST_COLUMNS = 200  # of w over all steps, in the search for the worst w that is fixed beforehand
 
@@ -118,7 +118,7 @@ class Analysis(NamedTuple):
         rungs = "\n           ".join(self.ladder.lines())
         then = f", then w = Gamma [x; e] for {_steps(self.steps - 1)}" if self.steps > 1 else ""
         if given.file is not None and given.file.certificate.holds and not self.foreign:
-            lines.append(f"claimed    gamma {given.file.certificate.gamma:.6f}; peakmesh verify checks it")
+            lines.append(f"claimed    gamma {given.file.certificate.gamma}; peakmesh verify checks it")
         lines += [
             f"stable     mean-square; each step multiplies E|error|^2 by {self.radius:.6g} in the long run",
             f"exact gain between {low:.8g} and {high:.8g}, from {self.horizon} steps and a bound on the rest",
@@ -191,15 +191,17 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
 def certified(problem: Problem, given: GivenGains) -> Gains:
     """A gains file of the given gains, with a certificate of their exact gain; or Unattainable."""
     certificate = certify(problem, given.K, given.H)
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
-        method="given",
-        K=given.K,
-        H=given.H,
-        certificate=certificate,
-        solver=Solver(name="none", version="-", status="the gains were given", iterations=0, seconds=0.0),
-        seconds={"total": 0.0},
+    return with_worst_case(
+        Gains(
+            problem=problem,
+            problem_digest=problem.digest(),
+            method="given",
+            K=given.K,
+            H=given.H,
+            certificate=certificate,
+            solver=Solver(name="none", version="-", status="the gains were given", iterations=0, seconds=0.0),
+            seconds={"total": 0.0},
+        )
     )
 
 

@@ -105,7 +105,9 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     shown = facts | {"gamma": "not claimed"}
     if facts["holds"]:
         command = "verify" if facts["kind"] == "gains" else "replay"
-        shown["gamma"] = f'claimed {facts["gamma"]:.6g}, by design; "peakmesh {command}" checks it'
+        shown["gamma"] = f'claimed {facts["gamma"]}, by design; "peakmesh {command}" checks it'
+    if facts.get("lmi_gamma") is not None:
+        shown["lmi_gamma"] = f"claimed {facts['lmi_gamma']:.6g}"
     if facts.get("exact"):
         shown["exact"] = "claimed between {:.6g} and {:.6g}".format(*facts["exact"])
     if facts.get("floor") is not None:

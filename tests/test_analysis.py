@@ -107,6 +107,15 @@ def test_somebody_elses_gains_get_a_certificate() -> None:
     assert Gains.from_bytes(gains.canonical(), source="memory") == gains
 
 
+def test_a_certificate_of_given_gains_brings_the_worst_w_that_the_problem_asks_for() -> None:
+    """Without it, `run` and `simulate` would refuse the file."""
+    document = find("two-nodes").document() | {"disturbance": {"kind": "worst-case"}}
+    problem = Problem.from_document(document)
+    gains = certified(problem, given(problem, 1, 0.1))
+    assert gains.worst_case is not None
+    assert np.linalg.norm(gains.worst_case) == pytest.approx(1.0)
+
+
 def drop_mode(document: Document) -> None:
     del document["K"]["2"]
 
