@@ -19,6 +19,7 @@ from matplotlib.ticker import MaxNLocator
 
 from agent.contract.arrays import Array
 from agent.contract.files import refuse_overwrite, write_whole
+from designer.ladder import rounded_up
 from designer.replay.gamma import checked_gamma
 from designer.replay.log import Log, load
 
@@ -132,7 +133,7 @@ def _canvas(log: Log, *, strip_height: float) -> tuple[Figure, list[Any], Any]:
 def _caption(log: Log) -> str:
     gamma = checked_gamma(log.gains)
     unproved = "γ is not proved" if gamma.is_claimed else "γ is not claimed"
-    proved = f"γ = {gamma.value:.6g}" if gamma.failure is None else unproved
+    proved = f"γ = {rounded_up(gamma.value)}" if gamma.failure is None else unproved
     return f"{log.gains.problem.name}, seed {log.seed}, {proved}"
 
 

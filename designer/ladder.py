@@ -6,6 +6,8 @@ have: that is how loose the bound is. What lies below both is what better gains 
 
 from __future__ import annotations
 
+import math
+from decimal import ROUND_CEILING, Decimal, localcontext
 from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
@@ -57,7 +59,11 @@ class Ladder(NamedTuple):
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
         at = 1 if self.exact is not None else 2
         rungs[at] = rungs[at][0], ": ".join([rungs[at][1], *([", ".join(remarks)] if remarks else [])])
-        return [f"{value:.6f}  {name}" for value, name in rungs if value is not None]
+        return [
+            f"{value:.6f}  {name}" if name == "floor" else f"{rounded_up(value)}  {name}"
+            for value, name in rungs
+            if value is not None
+        ]
 
 
 def ladder_of(gains: Gains) -> Ladder:
@@ -66,6 +72,13 @@ def ladder_of(gains: Gains) -> Ladder:
     gamma = proved.gamma if proved.holds else None
     lmi = "the LMI" if beyond_paper(gains.problem) else "Theorem 2"
     return Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi)
+
+
+def rounded_up(bound: float) -> str:
+    """Six decimals, of a small number six digits; never below the bound, because less than what is proved is not."""
+    decimals = max(6, 5 - math.floor(math.log10(bound)))
+    with localcontext(prec=800, rounding=ROUND_CEILING):
+        return f"{Decimal(str(bound)):.{decimals}f}"
 
 
 def percent(part: float) -> str:

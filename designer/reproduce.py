@@ -15,6 +15,7 @@ from designer.consensus import consensus_gains, least_variance_gains
 from designer.error_model import StackedGains
 from designer.exact_design import exact_bounds
 from designer.floor import floor
+from designer.ladder import rounded_up
 from designer.problems import find
 
 PRINTED = {"zhu2020-ideal": 0.23, "zhu2020-lossy": 0.36}  # gamma of examples 1 and 2
@@ -117,6 +118,8 @@ class Reproduced(NamedTuple):
         """One entry of the table."""
         if value is None:
             return {"consensus": "not stable", "least_variance": "not stable", "scs": "no answer"}.get(key, "-")
+        if key in ("certified", "exact"):
+            return rounded_up(value)
         return f"{value:g}" if key == "printed" else f"{value:.6f}"
 
     def remarks(self) -> list[str]:

@@ -1,7 +1,7 @@
 """What if a node or a link were not there: the problem without it, and the price of each.
 
 The certified gamma of a network bounds the errors of all its nodes together, so that of one node less is no measure of
-what the others lost. A removal is therefore priced against what the whole network's gains guarantee for the nodes that
+what the others lost. A removal is therefore priced against what the whole network's gains do for the nodes that
 remain. Removing a link leaves all nodes, and the comparison is with the whole network's gamma.
 """
 
@@ -22,7 +22,7 @@ from designer.certificate import lyapunov_matrix
 from designer.effort import default_method
 from designer.error_model import StackedGains, error_model, stacked_gains, stacked_links
 from designer.gain import exact_gain
-from designer.ladder import percent
+from designer.ladder import percent, rounded_up
 from designer.workers import each
 
 
@@ -72,7 +72,7 @@ class Priced(NamedTuple):
 
     part: str  # "node" or "link"
     name: str  # of the node, or A:B for what A hears from B
-    before: float  # what the whole network's gains guarantee for the nodes that remain
+    before: float  # what the whole network's gains do for the nodes that remain; computed, where nodes are fewer
     gamma: float | None  # certified without the part; None where nothing is
     reason: str | None  # why nothing is certified
 
@@ -128,14 +128,14 @@ def price(
     """
     parts = _parts(problem)
     whole = _design(problem, method)
-    report(1, 1 + len(parts), f"whole network: gamma {whole.certificate.gamma:.6f}")
+    report(1, 1 + len(parts), f"whole network: gamma {rounded_up(whole.certificate.gamma)}")
     jobs = [
         _Job(part, name, _bound_for(whole, rest), rest, method, _gains_left(whole, rest)) for part, name, rest in parts
     ]
     rows = []
     for done, row in enumerate(each(_priced, jobs, dask=dask, processes=processes), 2):
         rows.append(row)
-        said = f"gamma {row.gamma:.6f}" if row.gamma is not None else "no bound"
+        said = f"gamma {rounded_up(row.gamma)}" if row.gamma is not None else "no bound"
         report(done, 1 + len(parts), f"without {row.part} {row.name}: {said}")
     rows.sort(key=lambda row: -row.cost)
     return PriceTable(problem.name, method, problem.n, whole.certificate.gamma, rows)
@@ -143,17 +143,17 @@ def price(
 
 def price_text(table: PriceTable) -> str:
     """The table for people, and what its columns compare."""
-    lines = [f"{table.problem} by {table.method}: gamma = {table.gamma:.6f} for {table.nodes} nodes, certified"]
+    lines = [f"{table.problem} by {table.method}: gamma = {rounded_up(table.gamma)} for {table.nodes} nodes, certified"]
     if not table.rows:
         return f"{lines[0]}\nthere is one node and no link: nothing can be left out"
     width = max(12, *(len(f"{row.part} {row.name}") for row in table.rows))
     lines.append(f"{'left out':{width}}  gamma     before    cost")
     for row in table.rows:
-        gamma, cost = (f"{row.gamma:.6f}", percent(row.cost)) if row.gamma is not None else ("no bound", "")
-        lines.append(f"{f'{row.part} {row.name}':{width}}  {gamma}  {row.before:.6f}  {cost}{row.reason or ''}")
+        gamma, cost = (rounded_up(row.gamma), percent(row.cost)) if row.gamma is not None else ("no bound", "")
+        lines.append(f"{f'{row.part} {row.name}':{width}}  {gamma}  {rounded_up(row.before)}  {cost}{row.reason or ''}")
     lines += [
         "gamma      certified, designed anew without the part; it is over the nodes that remain",
-        "before     what the whole network's gains guarantee for those same nodes",
+        "before     for those same nodes, by the whole network's gains; computed, not proved, where a node is gone",
         "link A:B   what A hears from B",
     ]
     return "\n".join(lines)
@@ -199,7 +199,10 @@ def _design(problem: Problem, method: str, start: StackedGains | None = None) ->
 
 
 def _bound_for(whole: Gains, rest: Problem) -> float:
-    """What the whole network's gains guarantee for the nodes of `rest`, by the same kind of certificate."""
+    """What the whole network's gains do for the nodes of `rest`, by the same kind of bound.
+
+    Proved only where all nodes remain; else it is computed in floats.
+    """
     problem = whole.problem
     if rest.n == problem.n:
         return whole.certificate.gamma

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from itertools import pairwise
+
+import pytest
 
 from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.effort import LONGEST, default_method, in_words, seconds_of_exact
-from designer.ladder import Ladder, ladder_of, percent
+from designer.ladder import Ladder, ladder_of, percent, rounded_up
 from designer.problems import find, names
 from designer.synthesis import design
 
@@ -46,6 +49,20 @@ def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
     gains = design(Problem.from_document(document | {"unbiased": True}), method="decomposed")
     assert (ladder_of(gains).lmi, ladder_of(gains).theorem2) == ("the LMI", gains.certificate.lmi_gamma)
     assert ladder_of(design(find("two-nodes"), method="decomposed")).lmi == "Theorem 2"
+
+
+@pytest.mark.parametrize(
+    "bound", [0.34799211731349844, 1.0, 2.2, 0.1 + 0.2, 1.1e-9, 9.9999999e-4, 5e-324, 123456.7, 1e300]
+)
+def test_a_bound_is_never_rounded_down(bound: float) -> None:
+    """What is shown is not below it, by six decimals and six digits, whichever is more; its own decimals stay."""
+    shown = rounded_up(bound)
+    assert 0 <= Decimal(shown) - Decimal(str(bound)) < max(Decimal(str(bound)) / 10**5, Decimal(shown) / 10**9)
+    assert len(shown.partition(".")[2]) >= 6
+
+
+def test_bounds_are_shown_as_they_are_read() -> None:
+    assert [rounded_up(bound) for bound in (2.2, 0.3479921, 1.1e-9)] == ["2.200000", "0.347993", "0.00000000110000"]
 
 
 def test_percentages() -> None:

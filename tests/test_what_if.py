@@ -15,6 +15,7 @@ from designer.consensus import consensus_gains
 from designer.error_model import error_model, stacked_gains
 from designer.exact_design import design_exact
 from designer.gain import exact_gain
+from designer.ladder import rounded_up
 from designer.problems import find
 from designer.synthesis import design
 from designer.what_if import price, price_text, without_link, without_node
@@ -106,7 +107,7 @@ def test_the_price_of_parts_by_lmi() -> None:
     row = next(row for row in table.rows if row.name == "left")
     alone = design(without_node(problem, "left"), method="decomposed")
     assert row.gamma == pytest.approx(alone.certificate.gamma, rel=1e-6)
-    assert f"{row.gamma:.6f}" in price_text(table)
+    assert rounded_up(row.gamma) in price_text(table)
 
 
 def test_a_node_is_priced_against_what_the_others_had() -> None:

@@ -31,6 +31,7 @@ def add_analyse(commands: agent.cli.Subcommands) -> None:
 def analyse_command(options: argparse.Namespace) -> int:
     """`peakmesh analyse PROBLEM --gains FILE`: exit code 1 where the errors are not mean-square stable."""
     from designer.analysis import analyse, certified, load_given
+    from designer.ladder import rounded_up
     from designer.problems import find
 
     problem = find(options.problem)
@@ -43,6 +44,6 @@ def analyse_command(options: argparse.Namespace) -> int:
         gains = certified(problem, given)
         gains.save(options.output, force=options.force)
         facts |= {"gamma": gains.certificate.gamma, "output": str(options.output)}
-        text += f"\ngains      {options.output}, gamma = {gains.certificate.gamma:.6f}, certified"
+        text += f"\ngains      {options.output}, gamma = {rounded_up(gains.certificate.gamma)}, certified"
     print(json.dumps(facts) if options.json else text)
     return EXIT_GOOD if analysis.stable else EXIT_NO

@@ -133,13 +133,13 @@ def _chosen_method(problem: Problem) -> str:
 
 def design_text(result: dict[str, Any]) -> str:
     """The facts of a design, for people."""
-    from designer.ladder import Ladder
+    from designer.ladder import Ladder, rounded_up
 
     solver = result["solver"]
     rungs = {name: result["ladder"][name] for name in Ladder._fields}
     ladder = "\n           ".join(Ladder(**rungs).lines())
     return (
-        f"{result['problem']} by {result['method']}: gamma = {result['gamma']:.6f}, certified\n"
+        f"{result['problem']} by {result['method']}: gamma = {rounded_up(result['gamma'])}, certified\n"
         f"ladder     {ladder}\n"
         f"solver     {solver['name']} {solver['version']}: {solver['iterations']} iterations, "
         f"{result['seconds']['total']:.1f} s in all\n"

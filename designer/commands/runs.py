@@ -75,6 +75,7 @@ def run_command(options: argparse.Namespace) -> int:
             raise InputError(f"--method says how to design a problem; {path} has its gains already")
         options.gains = path
         return agent.cli.run_command(options)
+    from designer.ladder import rounded_up
     from designer.problems import find
 
     problem = find(options.gains)
@@ -83,7 +84,7 @@ def run_command(options: argparse.Namespace) -> int:
     refuse_overwrite(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
     gains, _ = design_and_save(problem, options.method, path, force=options.force)
-    print(f"designed {path}, gamma = {gains.certificate.gamma:.6f}", file=sys.stderr)
+    print(f"designed {path}, gamma = {rounded_up(gains.certificate.gamma)}", file=sys.stderr)
     result = {"gains": str(path), **agent.cli.run_gains(path, gains, options)}
     print(json.dumps(result) if options.json else f"{agent.cli.run_text(result)}\ngains      {path}")
     return EXIT_GOOD

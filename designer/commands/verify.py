@@ -35,8 +35,8 @@ def verify_command(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(verdict._asdict() | {"kind": kind, "seconds": seconds}))
     elif verdict.holds:
-        print(f"holds: gamma = {verdict.gamma:.6f} is proved\nproved  {PROVED[kind]}\nin      {how}")
+        print(f"holds: gamma = {verdict.gamma} is proved\nproved  {PROVED[kind]}\nin      {how}")
     else:
-        print(f"does not hold: gamma = {verdict.gamma:.6f} is not proved for {options.gains}: {verdict.failure}")
+        print(f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}")
         print(f"in      {how}")
     return EXIT_GOOD if verdict.holds else EXIT_NO
