@@ -75,8 +75,8 @@ def ladder_of(gains: Gains) -> Ladder:
 
 
 def rounded_up(bound: float) -> str:
-    """Six decimals, of a small number six digits; never below the bound, because less than what is proved is not."""
-    decimals = max(6, 5 - math.floor(math.log10(bound)))
+    """Six decimals, of a small number four digits; never below the bound, because less than what is proved is not."""
+    decimals = max(6, 3 - math.floor(math.log10(bound)))
     with localcontext(prec=800, rounding=ROUND_CEILING):
         return f"{Decimal(str(bound)):.{decimals}f}"
 

@@ -28,7 +28,7 @@ from designer.certificate import check, lyapunov_matrix, verify
 from designer.cli import main
 from designer.consensus import consensus_gains
 from designer.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
-from designer.gain import Operator, exact_gain
+from designer.gain import Operator, exact_gain, horizon_gain
 from designer.problems import find
 
 Document = dict[str, Any]
@@ -325,6 +325,25 @@ def test_with_few_bits_nothing_false_is_proved_and_nothing_true_is_proved_false(
         monkeypatch.setattr(certificate, "BITS", (bits,))
         assert not verify(false).holds
         assert "it is false" not in str(verify(gains).failure)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 3])
+def test_the_recursion_and_the_tail_have_as_many_steps_as_the_horizon(horizon: int) -> None:
+    """Where a step counts: at g below gamma_T^2 the recursion is false and above it proved; the tail is L^T(M'M)."""
+    gains = ALL["real", "exact"]
+    operator, modes = Operator(model_of(gains)), gains.problem.mode_names
+    low, high = horizon_gain(operator, horizon)
+    tail = operator.MM
+    for _ in range(horizon):
+        tail = operator.corner(tail)
+    with ctx.workprec(128):
+        model = BallModel(gains.problem, gains.K, gains.H)
+        for g, proved in ((high * (1.0 + 1e-6), True), (low * (1.0 - 1e-6), False)):
+            found = exact_certificate._recursion(model, modes, arb(g), horizon)
+            assert all(finding.sign.proved for finding in found) is proved
+            assert found[-1].sign.refuted is not proved
+        powers = np.array([floats(Z) for Z in exact_certificate._powers(model, horizon, above)])
+    np.testing.assert_allclose(powers, tail, rtol=0, atol=1e-12 * np.abs(tail).max())
 
 
 def test_a_tail_that_floats_find_too_small_is_proved_false(monkeypatch: pytest.MonkeyPatch) -> None:
