@@ -1,4 +1,4 @@
-"""A recording against the paper's centralised error model: what was logged, is it what the mathematics says?
+"""A recording against the centralised error model: what was logged, is it what the mathematics says?
 
 1. modes, losses, deliveries and disturbance are the seed's, plant and sensors obey them, and so does what each node
    says of itself;
