@@ -12,7 +12,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer import bfgs
+from designer import bfgs, descent
 from designer.barrier import Barrier, Entries
 from designer.certificate import verify
 from designer.consensus import consensus_gains, least_variance_gains
@@ -153,8 +153,9 @@ def test_starts_agree_with_what_real_networks_need(kind: str) -> None:
     np.testing.assert_allclose(stacked_links(problem, K, H)[0], found.chosen.K_bar, atol=1e-12)
 
 
-def test_a_start_that_is_not_mean_square_stable_leads_to_gains_that_are() -> None:
-    """The barrier is finite over 30 steps, however fast the errors grow."""
+def test_a_start_that_is_not_mean_square_stable_leads_to_gains_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The barrier is finite over 30 steps, however fast the errors grow. The coarse weights show it."""
+    monkeypatch.setattr(descent, "_FINE", (3e-4,))
     problem = real_network(random_problem(5, n=2), seen=True, delivery=0.6, unbiased=True, radius=1.3)
     start = consensus_gains(problem, weight=0.9)
     assert not exact_gain(error_model(problem, *start)).stable
@@ -177,8 +178,11 @@ def alone(beta: float) -> Problem:
     )
 
 
-def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_is_no_design() -> None:
+def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_is_no_design(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
+    monkeypatch.setattr(descent, "_FINE", (3e-4,))
     assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
     with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
         design_exact(alone(0.7), starts={"least variance": least_variance_gains(alone(0.7))})
