@@ -61,6 +61,10 @@ def perform(options: argparse.Namespace) -> int:
     except BrokenPipeError:  # the reader of our output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_GOOD
+    except MemoryError as error:
+        why = f" ({error})" if str(error) else ""
+        print(f"peakmesh: {options.command}: there is too little memory for this{why}; ask for less", file=sys.stderr)
+        return EXIT_BROKEN
     except OSError as error:
         print(f"peakmesh: {error.filename or options.command}: {error.strerror or error}", file=sys.stderr)
         return EXIT_INPUT

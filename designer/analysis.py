@@ -20,6 +20,7 @@ from agent.contract.errors import InputError, first_fault
 from agent.contract.files import read_bytes
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
+from designer.diagnosis import refuse_nothing_to_estimate
 from designer.error_model import error_model, stacked_links
 from designer.exact_design import certify
 from designer.floor import floor
@@ -75,7 +76,7 @@ class Analysis(NamedTuple):
             "designed_for": None if self.given.file is None else self.given.file.problem.name,
             "same_problem": None if self.given.file is None else not self.foreign,
             "stable": self.stable,
-            "radius": self.radius,
+            "radius": self.radius if math.isfinite(self.radius) else None,
             "exact": self.ladder.exact,
             "horizon": self.horizon,
             "floor": self.ladder.floor,
@@ -104,8 +105,9 @@ class Analysis(NamedTuple):
                 f"than the one here ({problem.digest()[:12]}...)"
             )
         if not self.stable:
+            growth = f"{self.radius:.6g}" if math.isfinite(self.radius) else "more than a float64 holds"
             lines.append(
-                f"NOT mean-square stable: in the long run each step multiplies E|error|^2 by {self.radius:.6g}; "
+                f"NOT mean-square stable: in the long run each step multiplies E|error|^2 by {growth}; "
                 "no gamma bounds the error"
             )
             if self.ladder.floor is None:
@@ -125,7 +127,8 @@ class Analysis(NamedTuple):
             f"ladder     {rungs}",
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
             f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
-            f'           that is fixed beforehand: gain {self.fixed:.6f} from mode "{problem.markov.initial}" '
+            f"           that is fixed beforehand: gain {self.fixed:.6g} "
+            f'from mode "{problem.markov.initial}" '
             f"over {_steps(self.fixed_within)}",
         ]
         return "\n".join(lines)
@@ -162,6 +165,7 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
 
 def analyse(problem: Problem, given: GivenGains) -> Analysis:
     """The exact gain of the gains on the problem, and what attains it."""
+    refuse_nothing_to_estimate(problem)
     model = error_model(problem, *stacked_links(problem, given.K, given.H))
     gain = exact_gain(model)
     exact = (gain.low, gain.high) if gain.stable else None

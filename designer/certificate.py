@@ -129,13 +129,13 @@ def lyapunov_matrix(gains: Gains) -> Array:
     P = np.zeros((len(problem.mode_names), n_eta, n_eta))
     for s, mode in enumerate(problem.mode_names):
         if certificate.form == "full":
-            P[s] = _stored(certificate.P or {}, mode, f"P of mode {mode}", n_eta)
+            P[s] = _stored(certificate.P, mode, f'P of mode "{mode}"', n_eta)
             continue
         if p:
-            P[s, :nx, :nx] = _stored({"R": certificate.R} if certificate.R is not None else {}, "R", "R", nx)
+            P[s, :nx, :nx] = _stored({"R": certificate.R} if certificate.R is not None else None, "R", "R", nx)
         for i, node in enumerate(problem.node_names):
             rows = slice(p + i * nx, p + (i + 1) * nx)
-            P[s, rows, rows] = _stored((certificate.Q or {}).get(mode, {}), node, f"Q of mode {mode}", nx)
+            P[s, rows, rows] = _stored((certificate.Q or {}).get(mode), node, f'Q of mode "{mode}", node "{node}",', nx)
     return P
 
 
@@ -157,10 +157,10 @@ def _refuse_other_matrices(problem: Problem, certificate: Certificate) -> None:
                 raise InputError(f'certificate: {what}: {kind} "{name}" does not exist; there are {listed(names)}')
 
 
-def _stored(matrices: dict[str, Array], name: str, what: str, size: int) -> Array:
-    if name not in matrices:
-        raise InputError(f'certificate: {what} lacks "{name}"; there is {listed(matrices) or "nothing"}')
+def _stored(matrices: dict[str, Array] | None, name: str, what: str, size: int) -> Array:
+    if matrices is None or name not in matrices:
+        raise InputError(f"certificate: {what} is missing; it must be {size} x {size}")
     if matrices[name].shape != (size, size):
         rows, columns = matrices[name].shape
-        raise InputError(f'certificate: {what}: "{name}" is {rows} x {columns}; it must be {size} x {size}')
+        raise InputError(f"certificate: {what} is {rows} x {columns}; it must be {size} x {size}")
     return matrices[name]

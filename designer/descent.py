@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer import bfgs
 from designer.barrier import Barrier
@@ -34,6 +35,7 @@ _SHORT = 1e-4  # gamma may exceed gamma_T by so much of itself before T is doubl
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
 _MOST_STEPS = 1000
+_NOTHING = 1e-200  # gamma^2 below this is 0
 
 
 class Progress(NamedTuple):
@@ -157,6 +159,11 @@ class _Search:
         """[v; y] with g 10 % above gamma_T^2."""
         v = self.barrier.entries.pack(*gains)
         _, g = horizon_gain(self.barrier.operator(v), self.barrier.horizon)
+        if g < _NOTHING:
+            raise InputError(
+                f"{self.problem.name}: its measurements show z exactly, so the error can be 0 and there is no least "
+                "gain to design for; give every measurement noise of its own in D, or take --method decomposed"
+            )
         return np.append(v, math.log(1.1 * g))
 
     def _follow(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from agent.contract.errors import Unattainable, listed
+from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.problem import Problem
 
 _NEARLY_UNSTABLE = 0.999
@@ -34,6 +34,21 @@ _ONE_BY_ONE = 100  # n nx modes up to which nodes and links are relaxed one by o
 def warnings(problem: Problem) -> list[str]:
     """What makes the design hard, or the result odd, though the problem is legal; each a sentence with its number."""
     return [*_warned_plant(problem), *_warned_chances(problem), *_warned_modes(problem)]
+
+
+def refuse_nothing_to_estimate(problem: Problem) -> None:
+    """InputError where z stays 0 whatever w is: M A^k B = 0 for every k."""
+    A, reached, M = problem.plant.A, problem.plant.B, problem.plant.M
+    if not M.any():
+        raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
+    for _ in range(problem.nx):
+        if (M @ reached).any():
+            return
+        reached = A @ reached
+    raise InputError(
+        "plant: no disturbance ever reaches z (M A^k B is zero for every k), so there is nothing to estimate; "
+        "give B or M entries that connect them"
+    )
 
 
 def refuse_hopeless(problem: Problem) -> None:

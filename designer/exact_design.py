@@ -23,6 +23,7 @@ from designer.gain import Gain, exact_gain
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
+_LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
 
@@ -44,6 +45,8 @@ def design_exact(
         )
     starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
     lmi_exact = next((exact_bounds(problem, *starts[name]) for name in _LMI_STARTS if name in starts), None)
+    if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
+        lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
     descent = descend(problem, starts, progress=progress)
     solved = time.perf_counter()

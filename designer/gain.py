@@ -146,6 +146,7 @@ def horizon_holds(operator: Operator, g: float, horizon: int) -> tuple[bool, flo
     return True, total
 
 
+@np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
 def exact_gain(model: ErrorModel) -> Gain:
     """The exact gain of an error model, between bounds that differ by 1e-6 of it at most; T is chosen on the way."""
     operator = Operator(model)
@@ -160,6 +161,7 @@ def exact_gain(model: ErrorModel) -> Gain:
     return Gain(math.sqrt(low), math.sqrt(high + tail), horizon, tail, P, radius)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def horizon_gain(
     operator: Operator, horizon: int, *, width: float = _WIDTH, low: float = 0.0, first: float | None = None
 ) -> tuple[float, float]:
@@ -175,6 +177,8 @@ def horizon_gain(
     g = growth * (low or max(_impulse(operator), np.finfo(float).tiny))
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > low * (1.0 + 1.001 * width):
+        if not math.isfinite(g):
+            return low, math.inf
         holds, measure = horizon_holds(operator, g, horizon)
         if holds:
             held = [*held[-2:], (g, measure)]
@@ -217,7 +221,8 @@ def _root(low: float, held: list[tuple[float, float]]) -> float | None:
 
 def _impulse(operator: Operator) -> float:
     """gamma_1^2: the gain of one step of w."""
-    return float(np.linalg.eigvalsh(operator.joint(operator.MM)[:, operator.size :, operator.size :]).max())
+    S_ww = operator.joint(operator.MM)[:, operator.size :, operator.size :]
+    return float(np.linalg.eigvalsh(S_ww).max()) if np.isfinite(S_ww).all() else math.inf
 
 
 def lyapunov(operator: Operator) -> tuple[Array | None, float]:

@@ -59,11 +59,10 @@ class Ladder(NamedTuple):
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
         at = 1 if self.exact is not None else 2
         rungs[at] = rungs[at][0], ": ".join([rungs[at][1], *([", ".join(remarks)] if remarks else [])])
-        return [
-            f"{value:.6f}  {name}" if name == "floor" else f"{rounded_up(value)}  {name}"
-            for value, name in rungs
-            if value is not None
-        ]
+        there = [(value, name) for value, name in rungs if value is not None]
+        texts = [(f"{value:.6f}" if name == "floor" else rounded_up(value), name) for value, name in there]
+        width = max((len(value) for value, _ in texts), default=0)
+        return [f"{value:{width}}  {name}" for value, name in texts]
 
 
 def ladder_of(gains: Gains) -> Ladder:

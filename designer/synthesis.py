@@ -16,7 +16,7 @@ from agent.contract.problem import Problem
 from designer.back_off import Confirmed, back_off, least_gamma, satisfies_17
 from designer.certificate import check
 from designer.descent import Progress
-from designer.diagnosis import explained, refuse_hopeless
+from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
 from designer.effort import default_method
 from designer.error_model import error_model, link_gains, stacked_links
 from designer.exact_design import design_exact, with_ladder
@@ -49,8 +49,7 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
     method = default_method(problem) if method is None else method
     if method not in METHODS and method != EXACT:
         raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
-    if not problem.plant.M.any():
-        raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
+    refuse_nothing_to_estimate(problem)
     refuse_hopeless(problem)
     try:
         return with_worst_case(

@@ -23,7 +23,7 @@ from designer.effort import default_method
 from designer.error_model import StackedGains, error_model, stacked_gains, stacked_links
 from designer.gain import exact_gain
 from designer.ladder import percent, rounded_up
-from designer.workers import each
+from designer.workers import each, greet_cluster
 
 
 # the problem without a part
@@ -126,6 +126,8 @@ def price(
     Method "exact" starts each of these from the whole network's gains. `report` gets how many designs are done, of
     how many, and the last of them in words.
     """
+    if dask is not None:
+        greet_cluster(dask)  # before the first design, which may take minutes
     parts = _parts(problem)
     whole = _design(problem, method)
     report(1, 1 + len(parts), f"whole network: gamma {rounded_up(whole.certificate.gamma)}")
@@ -147,10 +149,13 @@ def price_text(table: PriceTable) -> str:
     if not table.rows:
         return f"{lines[0]}\nthere is one node and no link: nothing can be left out"
     width = max(12, *(len(f"{row.part} {row.name}") for row in table.rows))
-    lines.append(f"{'left out':{width}}  gamma     before    cost")
+    values = [value for row in table.rows for value in (row.gamma, row.before) if value is not None]
+    columns = max(8, *(len(rounded_up(value)) for value in values))
+    lines.append(f"{'left out':{width}}  {'gamma':{columns}}  {'before':{columns}}  cost")
     for row in table.rows:
         gamma, cost = (rounded_up(row.gamma), percent(row.cost)) if row.gamma is not None else ("no bound", "")
-        lines.append(f"{f'{row.part} {row.name}':{width}}  {gamma}  {rounded_up(row.before)}  {cost}{row.reason or ''}")
+        before = f"{gamma:{columns}}  {rounded_up(row.before):{columns}}"
+        lines.append(f"{f'{row.part} {row.name}':{width}}  {before}  {cost}{row.reason or ''}")
     lines += [
         "gamma      certified, designed anew without the part; it is over the nodes that remain",
         "before     for those same nodes, by the whole network's gains; computed, not proved, where a node is gone",

@@ -45,6 +45,24 @@ def each(
     return map(function, items) if number <= 1 else _on_processes(function, items, number)
 
 
+def greet_cluster(address: str) -> None:
+    """InputError where no Dask scheduler answers at this address, or the package to ask it with is missing."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "a Dask cluster needs the package distributed, which is not installed; pip install 'peakmesh[dask]'"
+        ) from None
+    try:
+        asyncio.run(_greet(address))
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise _nobody(address, error) from None
+
+
+def _nobody(address: str, error: Exception) -> InputError:
+    return InputError(f"no Dask scheduler answers at {address}: {str(error) or f'nothing came within {PATIENCE} s'}")
+
+
 def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], number: int) -> Iterator[Result]:
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
@@ -73,18 +91,13 @@ def _end_with_parent() -> None:
 
 
 def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], address: str) -> Iterator[Result]:
+    greet_cluster(address)
+    import distributed
+
     try:
-        import distributed
-    except ImportError:
-        raise InputError(
-            "a Dask cluster needs the package distributed, which is not installed; pip install 'peakmesh[dask]'"
-        ) from None
-    try:
-        asyncio.run(_greet(address))
         client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:  # TimeoutError is an OSError
-        why = str(error) or f"nothing came within {PATIENCE} s"
-        raise InputError(f"no Dask scheduler answers at {address}: {why}") from None
+    except (OSError, ValueError) as error:
+        raise _nobody(address, error) from None
     try:
         try:
             client.wait_for_workers(1, timeout=PATIENCE)

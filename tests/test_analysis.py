@@ -97,6 +97,17 @@ def test_unstable_gains_have_no_gain() -> None:
         certified(problem, wild)
 
 
+def test_gains_beyond_float64_are_unstable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither a warning of numpy nor a NaN in the JSON."""
+    gains = {"linked": {"left": {"left": [[1e200]], "right": [[0.0]]}, "right": {"left": [[0.0]], "right": [[1e200]]}}}
+    (tmp_path / "huge.json").write_text(json.dumps({"K": gains, "H": gains}))
+    problem = find("two-nodes")
+    analysis = analyse(problem, load_given(tmp_path / "huge.json", problem))
+    assert not analysis.stable
+    json.dumps(analysis.document(), allow_nan=False)
+    assert "NOT mean-square stable" in analysis.text()
+
+
 def test_somebody_elses_gains_get_a_certificate() -> None:
     """It holds, and gamma is the exact gain."""
     problem = random_problem(2)

@@ -95,6 +95,25 @@ def test_a_certificate_that_fails_is_an_answer(folder: Path, gains: Gains, capsy
     assert "does not hold: " in capsys.readouterr().out
 
 
+def test_a_senseless_certificate_is_refused(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """One sentence names the file, the place and what would be right; a horizon without end is not begun."""
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    text = Path("gains.json").read_text()
+    for edit, sentence in {
+        ("gamma", 1e300): "edited.json: certificate: gamma: must be less than 1e+150, got 1e+300",
+        ("gamma", 1e-300): "edited.json: certificate: gamma: must be greater than 1e-150, got 1e-300",
+        ("horizon", 10**9): "edited.json: certificate: horizon is 1000000000; ",
+        ("horizon", None): "edited.json: certificate: horizon is None; ",
+        ("P", None): 'edited.json: certificate: P of mode "linked" is missing; it must be ',
+    }.items():
+        document = json.loads(text)
+        document["certificate"][edit[0]] = edit[1]
+        Path("edited.json").write_text(json.dumps(document))
+        capsys.readouterr()
+        assert run("verify", "edited.json") == 2
+        assert capsys.readouterr().err.startswith(f"peakmesh: {sentence}")
+
+
 def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
     """Report writes both pictures as SVG and PNG, and does not replace them unasked."""
     record(Path("run.mcap"), gains, simulate(gains, steps=30), steps=30)
@@ -181,6 +200,7 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
     assert not Path("never.json").exists()
     for words, sentence in {
         ("--dask", "tcp://127.0.0.1:1"): "--dask spreads the many designs of --price",
+        ("--price", "--dask", "tcp://127.0.0.1:1"): "no Dask scheduler answers at tcp://127.0.0.1:1: ",
         ("--price", "-o", "never.json"): "--price writes no gains file",
         ("--without-link", "left"): "--without-link left: a link is A:B",
         ("--without-link", "left:left"): "a node always hears itself",
@@ -189,7 +209,8 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
         ("--without-node", "left", "--without-node", "right"): "is the only node of two-nodes-without-left",
     }.items():
         assert run("design", "two-nodes", *words) == 2
-        assert sentence in capsys.readouterr().err
+        assert sentence in (said := capsys.readouterr().err)
+        assert "designs, whole network" not in said
 
 
 # The whole job, and what is kept of an old one.

@@ -36,6 +36,14 @@ def test_what_is_not_there_is_not_said() -> None:
     assert Ladder(1e-12, (0.9, 1.0), None, None, None).above_floor is None
 
 
+def test_numbers_of_different_length_stand_in_one_column() -> None:
+    assert Ladder(0.0, (0.017, 0.0179884), 0.0179885, None, 0.2).lines()[1:] == [
+        "0.0179884  exact gain of these gains: -91.0 % against Theorem 2's bound",
+        "0.0179885  gamma, certified",
+        "0.200000   Theorem 2's bound",
+    ]
+
+
 def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
     """The name of the LMI stands on every line that speaks of it."""
     lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI").lines()

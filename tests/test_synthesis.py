@@ -121,3 +121,30 @@ def test_the_best_confirmed_answer_is_kept_where_none_is_near_its_gamma(monkeypa
     assert gains.certificate.lmi_gamma == claims[0].gamma
     assert gains.solver.status == "optimal; tried further: made up optimal"
     assert gains.certificate.gamma == pytest.approx(np.sqrt(2.0), rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["exact", "decomposed"])
+@pytest.mark.parametrize(("M", "B"), [([[0.0, 0.0]], [[1.0], [1.0]]), ([[1.0, 0.0]], [[0.0], [1.0]])])
+def test_a_z_that_never_moves_is_refused(method: str, M: list[list[float]], B: list[list[float]]) -> None:
+    """M = 0, or no w reaches z: the best error is 0, and no gamma above 0 is the least."""
+    plant = {"A": [[0.5, 0.0], [0.1, 0.4]], "B": B, "M": M}
+    with pytest.raises(InputError, match="nothing to estimate"):
+        design(Problem.from_document(one_node(plant, C=[[1.0, 1.0]])), method=method)
+
+
+def test_an_error_that_can_be_0_has_no_least_gain() -> None:
+    """The node measures w itself, so its estimate can be exact."""
+    document = one_node({"A": [[0.5]], "B": [[1.0]], "M": [[1.0]]}, C=[[0.0]])
+    with pytest.raises(InputError, match="no least gain"):
+        design(Problem.from_document(document), method="exact")
+
+
+def one_node(plant: dict[str, object], C: list[list[float]]) -> dict[str, object]:
+    """A node that is alone and measures C x + w without loss."""
+    return {
+        "name": "alone",
+        "plant": plant,
+        "node": [{"name": "a", "C": C, "D": [[1.0]], "arrival_probability": 1.0}],
+        "topology": [{"name": "still", "adjacency": [[1.0]]}],
+        "markov": {"transition": [[1.0]], "initial": "still"},
+    }

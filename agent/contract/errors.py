@@ -76,7 +76,7 @@ def first_fault(error: ValidationError, document: Any) -> str:
             return f'{place}"{fault["loc"][-1]}" is missing'
         case "extra_forbidden":
             absent = [str(f["loc"][-1]) for f in faults if f["type"] == "missing"]
-            hint = f"; {listed(absent)} is missing" if absent else ""
+            hint = f"; {listed(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else ""
             return f"{place}this key is not known here{hint}"
         case "value_error":
             return f"{place}{fault['ctx']['error']}"
@@ -85,6 +85,8 @@ def first_fault(error: ValidationError, document: Any) -> str:
         case "union_tag_invalid":
             known = fault["ctx"]["expected_tags"].replace("'", '"')
             return f'{place}kind "{fault["ctx"]["tag"]}" is not known; there are {known}'
+        case "tuple_type" if isinstance(fault["input"], dict):
+            return f"{place}must be a list; write [[{fault['loc'][0]}]], once for each entry"
         case kind:
             wanted = _WANTED.get(kind, _lower(fault["msg"])).format(**fault.get("ctx", {}))
             return f"{place}{wanted}, got {shortened(fault['input'])}"
@@ -103,7 +105,8 @@ _WANTED = {  # what pydantic asks for, as a person says it who writes TOML
     "dict_type": "must be a table of keys and values",
     "tuple_type": "must be a list",
     "list_type": "must be a list",
-    "too_short": "must have at least {min_length}",
+    "less_than": "must be less than {lt:g}",
+    "too_short": "must not be empty",
 }
 
 

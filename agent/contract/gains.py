@@ -39,7 +39,7 @@ class Certificate(Model):
     eta = [x; e_1; ...; e_n], nodes in file order, or e alone where the errors do not depend on x.
     """
 
-    gamma: Number = Field(gt=0.0)
+    gamma: Number = Field(gt=1e-150, lt=1e150)  # so that gamma^2 is a float64
     kind: Literal["lyapunov", "exact"]
     form: Literal["structured", "full"]
     R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx); None with e alone

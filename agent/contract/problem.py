@@ -293,11 +293,24 @@ class Problem(Model):
     # what must hold
     @model_validator(mode="before")
     @classmethod
+    def _unbiased_before_tables(cls, document: Any) -> Any:
+        for name, table in document.items() if isinstance(document, dict) else ():
+            entries = table if isinstance(table, list) else [table]
+            if any(isinstance(entry, dict) and "unbiased" in entry for entry in entries):
+                raise ValueError(f"unbiased stands in the table {name}; it belongs at the top, before every table")
+        return document
+
+    @model_validator(mode="before")
+    @classmethod
     def _adjacency_from_hears(cls, document: Any) -> Any:
         if not isinstance(document, dict) or not isinstance(document.get("topology"), list):
             return document
         nodes = document.get("node")
-        nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list) else []
+        nodes = (
+            [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list | tuple) else []
+        )
+        if not nodes:
+            return {**document, "topology": []}  # that is the fault to report, not the names that nobody has
         _refuse_duplicates("node", tuple(nodes))  # before names are looked up among them
         topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]
         return {**document, "topology": topologies}

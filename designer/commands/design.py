@@ -74,12 +74,12 @@ def design_command(options: argparse.Namespace) -> int:
 def _what_is_left(problem: Problem, nodes: list[str], links: list[str]) -> Problem:
     from designer.what_if import without_link, without_node
 
-    for link in links:
+    for link in dict.fromkeys(links):
         receiver, colon, sender = link.partition(":")
         if not (receiver and colon and sender):
             raise InputError(f"--without-link {link}: a link is A:B, two nodes of which A hears B")
         problem = without_link(problem, receiver, sender)
-    for name in nodes:
+    for name in dict.fromkeys(nodes):
         problem = without_node(problem, name)
     return problem
 
@@ -97,7 +97,7 @@ def design_and_save(
     warned = warnings(problem)
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
-    gains = design(problem, method=method or _chosen_method(problem), progress=_descent_progress())
+    gains = design(problem, method=_chosen_method(problem) if method is None else method, progress=_descent_progress())
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {
@@ -158,7 +158,7 @@ def _descent_progress() -> Callable[[Progress], None]:
         if progress.seconds >= shown + 2.0:
             shown = progress.seconds
             print(
-                f"{progress.seconds:5.0f} s  from {progress.start}: gamma < {progress.gamma:.6f} "
+                f"{progress.seconds:5.0f} s  from {progress.start}: gamma < {progress.gamma:.6g} "
                 f"after {progress.steps} steps; Ctrl-C keeps the best so far",
                 file=sys.stderr,
             )
@@ -172,7 +172,7 @@ def _price_command(problem: Problem, options: argparse.Namespace) -> int:
 
     if options.output is not None:
         raise InputError("--price writes no gains file; leave --output out, or --price")
-    method = options.method or price_method(problem)
+    method = price_method(problem) if options.method is None else options.method
 
     def show(done: int, of: int, what: str) -> None:
         print(f"{done:4d} of {of} designs, {what}", file=sys.stderr)

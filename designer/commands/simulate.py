@@ -163,10 +163,10 @@ def _text(facts: dict[str, Any]) -> str:
         f"peak       {_interval(peak)}",
     ]
     if closest is None:
-        lines += ["bound      0: without a disturbance gamma allows for no error"]
+        lines += ["bound      0: no disturbance comes before these steps, and gamma allows for no error without one"]
     else:
         lines += [
-            f"closest    {_interval(closest)}, {closest['mean_square'] / closest['bound']:.1%} of it",
+            f"closest    {_interval(closest)}, {_of_bound(closest)}",
             f"gain       {facts['gain']:.6g} there, the root of mean over energy; gamma is {facts['gamma']:.6g}"
             + ("" if facts["claimed"] else ", which the file does not claim"),
         ]
@@ -180,12 +180,18 @@ def _text(facts: dict[str, Any]) -> str:
     else:
         lines += ["not refuted, which proves nothing; peakmesh verify does"]
     lines += [
-        f"confidence {facts['confidence']:.0%} for all steps at once; intervals by the central limit theorem,",
+        f"confidence {100.0 * facts['confidence']:.0f} % for all steps at once; "
+        "intervals by the central limit theorem,",
         "           upper ends too low where few runs carry the mean;",
         "           what refutes is a lower bound of the mean that holds for every distribution",
     ]
     lines += [f"steps      {facts['output']}"] if facts["output"] is not None else []
     return "\n".join(lines)
+
+
+def _of_bound(at: dict[str, Any]) -> str:
+    ratio = at["mean_square"] / at["bound"]
+    return f"{100.0 * ratio:.1f} % of it" if ratio < 10.0 else f"{ratio:.3g} times as much"
 
 
 def _interval(at: dict[str, Any]) -> str:

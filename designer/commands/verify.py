@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import agent.cli
-from agent.contract.errors import EXIT_GOOD, EXIT_NO
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
@@ -29,7 +29,10 @@ def verify_command(options: argparse.Namespace) -> int:
 
     gains = agent.cli.load_gains(options.gains)
     started = time.perf_counter()
-    verdict = verify(gains)
+    try:
+        verdict = verify(gains)
+    except InputError as error:
+        raise InputError(f"{options.gains}: {error}") from None
     seconds = time.perf_counter() - started
     kind, how = gains.certificate.kind, f"{verdict.arithmetic}; {seconds:.2f} s"
     if options.json:
