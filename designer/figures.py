@@ -148,17 +148,18 @@ def _shown_steps(log: Log) -> int:
 def _draw_modes(axes: Any, log: Log) -> None:
     """The staircase of figure 2; of a long run, how much of every stretch each mode has."""
     names = log.gains.problem.mode_names
-    if log.steps <= STAIRS:
-        known = (log.mode >= 0) & (log.mode < len(names))
-        axes.step(np.arange(log.steps), np.where(known, log.mode, np.nan), where="post", color=GREY, linewidth=0.9)
+    mode = log.mode[: _shown_steps(log)]
+    if len(mode) <= STAIRS:
+        known = (mode >= 0) & (mode < len(names))
+        axes.step(np.arange(len(mode)), np.where(known, mode, np.nan), where="post", color=GREY, linewidth=0.9)
     else:
-        here = log.mode[: log.steps - log.steps % STRETCHES].reshape(STRETCHES, -1)
+        here = mode[: len(mode) - len(mode) % STRETCHES].reshape(STRETCHES, -1)
         shares = [(here == s).mean(axis=1) for s in range(len(names))]
         extent = (0, here.size, -0.5, len(names) - 0.5)
         axes.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", aspect="auto", extent=extent)
     axes.set_ylim(-0.5, len(names) - 0.5)
     axes.set_yticks(range(len(names)), names if len(names) <= 8 else [""] * len(names))
-    axes.set_ylabel("mode" if log.steps <= STAIRS else "mode (share)")
+    axes.set_ylabel("mode" if len(mode) <= STAIRS else "mode (share)")
 
 
 def _draw_norm(axes: Any, log: Log) -> None:

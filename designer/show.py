@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from agent.contract.errors import InputError, listed
+from agent.contract.errors import InputError, counted, listed
 from agent.contract.files import read_bytes
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
@@ -40,6 +40,8 @@ def describe(file: str | Path | None = None) -> dict[str, Any]:
 
 def text(facts: dict[str, Any]) -> str:
     """The same for people: a line for each fact, topics of all nodes taken together, what gains claim as a claim."""
+    if facts["kind"] == "built-in problems":
+        facts = facts["problems"]
     if "messages" in facts:
         facts = facts | {"messages": _by_kind(facts["messages"])}
     if "holds" in facts:
@@ -58,7 +60,8 @@ def _built_in(name: str) -> Problem:
 
 
 def _size(problem: Problem) -> str:
-    return f"{problem.n} nodes, {problem.nx} states, {len(problem.topologies)} modes"
+    sizes = (problem.n, "node"), (problem.nx, "state"), (len(problem.topologies), "mode")
+    return ", ".join(counted(number, noun) for number, noun in sizes)
 
 
 def _problem(problem: Problem) -> dict[str, Any]:

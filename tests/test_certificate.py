@@ -267,7 +267,7 @@ def test_an_edited_problem_is_refused() -> None:
 def test_a_certificate_without_its_matrices_is_malformed_input() -> None:
     """A missing Q of one node is bad input, named; so is a P of the wrong size."""
     golden = Gains.load(GOLDEN)
-    with pytest.raises(InputError, match='Q of mode 2 lacks "3"'):
+    with pytest.raises(InputError, match='Q of mode "2", node "3", is missing'):
         verify(mutated(golden, lambda document: document["certificate"]["Q"]["2"].pop("3")))
     with pytest.raises(InputError, match="it must be 2 x 2"):
         verify(mutated(golden, lambda document: document["certificate"].update(R=[[1.0]])))

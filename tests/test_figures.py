@@ -70,6 +70,14 @@ def test_the_caption_says_what_is_shown_and_a_note_what_is_not() -> None:
         assert hidden <= 0.01 * np.abs(np.hstack([log.z, log.z_hat])).max()
 
 
+def test_modes_are_a_staircase_where_few_steps_of_a_long_run_are_shown(tmp_path: Path) -> None:
+    log = load(make(tmp_path, steps=figures.STAIRS + 100))
+    strip = figures.outputs_figure(log).axes[-1]
+    shown = round(strip.get_xlim()[1]) + 1
+    assert shown < figures.STAIRS
+    np.testing.assert_array_equal(strip.lines[0].get_ydata(), log.mode[:shown])
+
+
 @pytest.mark.parametrize("n", [2, 8])
 def test_nodes_that_coincide_are_told_apart(tmp_path: Path, n: int) -> None:
     log = load(make(tmp_path, ny=(1,) * n, steps=200))
