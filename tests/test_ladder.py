@@ -37,9 +37,9 @@ def test_what_is_not_there_is_not_said() -> None:
 
 
 def test_numbers_of_different_length_stand_in_one_column() -> None:
-    assert Ladder(0.0, (0.017, 0.0179884), 0.0179885, None, 0.2).lines()[1:] == [
-        "0.0179884  exact gain of these gains: -91.0 % against Theorem 2's bound",
-        "0.0179885  gamma, certified",
+    assert Ladder(0.0, (1.7e-4, 1.79884e-4), 1.8e-4, None, 0.2).lines()[1:] == [
+        "0.0001799  exact gain of these gains: -99.9 % against Theorem 2's bound",
+        "0.0001800  gamma, certified",
         "0.200000   Theorem 2's bound",
     ]
 
