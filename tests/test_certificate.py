@@ -522,6 +522,29 @@ def test_radii_count() -> None:
         assert not found.refuted
 
 
+def test_a_ball_with_members_of_either_sign_has_none() -> None:
+    """Off the diagonal radii below 1 leave the identity positive; on it, one beyond the middle says nothing."""
+    for radius, proved in ((0.9, True), (1.1, False)):
+        S = arb_mat(2, 2, [arb(1), arb(0, radius), arb(0, radius), arb(1)])
+        assert sign(S, np.ones(2)).proved is proved
+    for middle in (-0.1, 0.1):
+        found = sign(arb_mat(1, 1, [arb(middle, 0.2)]), np.ones(1))
+        assert (found.proved, found.refuted) == (False, False)
+
+
+@pytest.mark.parametrize("probability", [1e-300, 1.0 - 2.0**-53])
+def test_no_chance_is_too_small_to_count(probability: float) -> None:
+    """Every probability below 1, however near to 0 or 1, has its terms."""
+    document = find("two-nodes").document()
+    for node in document["node"]:
+        node["arrival_probability"] = probability
+    document["link"] = [{"receiver": "left", "sender": "right", "delivery_probability": probability}]
+    zero = np.zeros((1, 2, 2))
+    problem = Problem.from_document(document)
+    (noise,) = BallModel(problem, *link_gains(problem, zero, zero)).noise
+    assert len(noise) == 4  # of two sensors, of the link, and of the link and its sender
+
+
 def test_what_overflows_is_left_undecided() -> None:
     """Numbers outside the range of floats are no sign and no exception."""
     found = sign(exact(np.eye(2)) * arb(2) ** 5000, np.full(2, np.inf))
