@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -145,7 +146,8 @@ NETWORKS: dict[str, Callable[..., Problem]] = {
 def measure(method: str, name: str, seed: int) -> dict[str, Any]:
     """One design in a process of its own."""
     child = [sys.executable, "-c", CHILD, method, name, str(seed)]
-    done = subprocess.run(child, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # as the program does
+    done = subprocess.run(child, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         sys.exit(f"{method}, {name}: {done.stderr.strip().splitlines()[-1]}")
     return dict(json.loads(done.stdout))
