@@ -33,11 +33,12 @@ def test_the_ladder_holds(paper: Reproduced, name: str) -> None:
 
 def test_what_is_said_of_the_printed_values(paper: Reproduced) -> None:
     """One lies below the optimum and one above; the distances are those of the table."""
-    first, second = paper.remarks()
+    first, reached, second = paper.remarks()
     below, above = (PRINTED[name] / value(paper, name, "clarabel") - 1.0 for name in EXAMPLES)
     assert below < 0.0 < above
     assert f"{-100.0 * below:.1f} % below the optimum" in first
     assert "cannot come from (42)" in first
+    assert f"{value(paper, EXAMPLES[0], 'theorem2_exact'):.4f}" in reached
     assert f"{100.0 * above:.1f} % above the optimum" in second
 
 
