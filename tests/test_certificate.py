@@ -281,7 +281,7 @@ def test_a_certificate_without_its_matrices_is_malformed_input() -> None:
         ({"R": [[1.0, 0.0], [0.0, 1.0]]}, 'form "full" has "P" for these errors, and no R'),
         ({"form": "structured"}, 'form "structured" has "Q" and "R" for these errors, and no P'),
         ({"P": {"1": [[1.0]]}}, "it must be 10 x 10"),
-        ({"P": {}}, 'P of mode 1 lacks "1"; there is nothing'),
+        ({"P": {}}, 'P of mode "1" is missing; it must be 10 x 10'),
     ],
 )
 def test_a_certificate_that_no_proof_can_be_read_from_is_refused(certificate: Document, why: str) -> None:

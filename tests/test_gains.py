@@ -168,7 +168,7 @@ def unstable_plant(document: dict[str, Any]) -> None:
         (put_nan, "K: mode-0: n0: n0: row 2 holds nan; every entry must be a finite float64"),
         (put_gamma_string, "certificate: gamma: must be a number, got '1.0'"),
         (put_gamma_nan, "certificate: gamma: must be finite, got nan"),
-        (put_gamma_0, "certificate: gamma: must be greater than 0, got 0"),
+        (put_gamma_0, "certificate: gamma: must be greater than 1e-150, got 0"),
         (unstable_plant, "problem: plant: A is unstable: its spectral radius is 2 and must be below 1, "
                          "because the errors contain the state; an unstable plant needs unbiased = true, "
                          'and loss = "seen" at every node that loses measurements'),
