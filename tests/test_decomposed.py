@@ -16,12 +16,13 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains, Solver
 from agent.contract.problem import Problem
 from benchmarks.design import banded
-from designer.back_off import least_gamma
+from designer.back_off import back_off, least_gamma
 from designer.certificate import check, verify
 from designer.error_model import error_model, link_gains
 from designer.inwards import inwards
 from designer.lmi import cliques, conic, decomposed, theorem2
 from designer.lmi.cones import Assembly
+from designer.lmi.units import natural_units
 from designer.lmi.witness import Witness, witness
 from designer.problems import find
 from designer.synthesis import block_diagonal, design, recover
@@ -73,6 +74,24 @@ def test_the_optimum_is_that_of_the_witness(problem: Problem) -> None:
     written = witness(problem)
     written.problem.solve(solver=cp.CLARABEL)
     assert decomposed.solve(problem).gamma == pytest.approx(np.sqrt(written.delta.value), rel=1e-5)
+
+
+@networks
+def test_the_optimum_does_not_depend_on_the_units_of_errors(problem: Problem) -> None:
+    """Errors measured in other units than states, as in large networks: the same gamma, and gains that keep it."""
+    record, solution = decomposed._run(problem, conic.clarabel, natural_units(problem)._replace(error=1.5))
+    assert record.status.startswith("optimal")
+    assert solution is not None
+    assert solution.gamma == pytest.approx(decomposed.solve(problem).gamma, rel=1e-4)
+    K, H = link_gains(problem, *recover(problem, solution))
+    confirmed = back_off(problem, K, H, block_diagonal(solution.R, solution.Q))
+    assert confirmed.verdict.holds
+    assert confirmed.verdict.gamma < solution.gamma * (1.0 + 1e-3)
+
+
+def test_large_networks_measure_errors_in_larger_units() -> None:
+    """Up to 8 nodes errors have the state's units; of 32 nodes twice as large ones."""
+    assert [natural_units(banded(n)).error for n in (4, 8, 32)] == [1.0, 1.0, 2.0]
 
 
 @networks

