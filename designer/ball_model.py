@@ -141,7 +141,11 @@ class BallModel:
     @property
     def MM(self) -> arb_mat:
         """M'M: what |z_tilde|^2 is of eta, (n_eta, n_eta)."""
-        return self.M.transpose() * self.M
+        MM, nz = arb_mat(self.size, self.size), self.M.nrows() // len(self.e)
+        for i, e_i in enumerate(self.e):
+            M_i = part(self.M, range(i * nz, (i + 1) * nz), e_i)
+            add(MM, e_i, e_i, M_i.transpose() * M_i)
+        return MM
 
     def joint(self, Y: list[arb_mat]) -> list[arb_mat]:
         """E|eta+|^2 weighed by Y(t), t the next mode, as a quadratic form in [eta; w], for every mode.

@@ -7,6 +7,7 @@ is said of a matrix here is therefore said of the exact one. `flint.ctx.prec` is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -25,17 +26,29 @@ class Sign(NamedTuple):
 
 
 UNDECIDED = Sign(proved=False, refuted=False, least=0.0)
+Entries = dict[tuple[int, int], arb]  # by row and column; the others are exactly 0
+
+_RESOLVED = 1e-12  # floats know an eigenvalue this far above 0, of a matrix with about 1 on its diagonal
+_SMALL = 16  # up to this order eigenvectors are as fast
+_FEW = 8  # a row is sparse while it has at most one in so many entries
 
 
 def exact(matrix: Array) -> arb_mat:
     """The floats of a matrix, each as it is."""
-    rows, columns = matrix.shape
-    return arb_mat(rows, columns, [arb(entry) for entry in matrix.ravel().tolist()])
+    balls, numbers = arb_mat(*matrix.shape), matrix.tolist()
+    for i, j in np.argwhere(matrix).tolist():
+        balls[i, j] = numbers[i][j]
+    return balls
 
 
 def floats(matrix: arb_mat) -> Array:
     """The midpoints, rounded."""
     return np.array([float(entry) for entry in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
+
+
+def diagonal(matrix: arb_mat) -> Array:
+    """The midpoints of a square matrix on its diagonal, rounded."""
+    return np.array([float(matrix[i, i]) for i in range(matrix.nrows())])
 
 
 def identity(order: int) -> arb_mat:
@@ -57,17 +70,123 @@ def add(matrix: arb_mat, rows: Sequence[int], columns: Sequence[int], block: arb
 def sign(S: arb_mat, sizes: Array) -> Sign:
     """Whether the exact symmetric matrix within S is positive definite; sizes: what its diagonal is measured by.
 
-    Where S falls apart into blocks, as (18) does by nodes, each is looked at by itself.
+    What Cholesky does not prove is looked at by eigenvectors, which are slower and see further: block by block, where
+    S falls apart, as (18) does by nodes.
     """
-    found = blocks(S)
-    if len(found) == 1:
-        return _sign(S, sizes)
-    signs = [_sign(part(S, block, block), sizes[block]) for block in found]
+    if S.nrows() > _SMALL:
+        found = by_cholesky(S, sizes)
+        if found.proved:
+            return found
+    signs = [by_eigenvectors(part(S, block, block), sizes[block]) for block in blocks(S)]
     return Sign(
         proved=all(each.proved for each in signs),
         refuted=any(each.refuted for each in signs),
         least=min(each.least for each in signs),
     )
+
+
+def by_cholesky(S: arb_mat, sizes: Array) -> Sign:
+    """Proved, or undecided: S is positive definite if S - LL' is, whatever L is.
+
+    Floats find L: the Cholesky factor of the scaled midpoints less half their least eigenvalue. So S - LL' is nearly
+    that half, if floats resolve it, and balls prove it diagonally dominant. Where S is sparse, so is L.
+    """
+    entries, scale = nonzero(S), _scale(sizes)
+    middle = np.zeros((S.nrows(), S.nrows()))
+    for place, entry in entries.items():
+        middle[place] = float(entry)
+    with np.errstate(all="ignore"):  # what overflows is left undecided
+        middle *= scale * scale[:, None]
+    if not np.isfinite(middle).all():
+        return UNDECIDED
+    least = float(np.linalg.eigvalsh(middle)[0])
+    if not least > _RESOLVED:
+        return UNDECIDED
+    found = fronts(middle != 0.0)
+    order = [k for pivots, _ in found for k in pivots]
+    reordered, L = np.ix_(order, order), np.zeros_like(middle)
+    try:
+        L[reordered] = np.linalg.cholesky((middle - 0.5 * least * np.eye(len(order)))[reordered])
+    except np.linalg.LinAlgError:
+        return UNDECIDED
+    L = np.rint(L * 2.0**52) * 2.0**-52  # flint multiplies numbers of one exponent faster
+    for pivots, border in found:  # the columns of L at these pivots, and their part of LL'
+        rows = [*pivots, *border]
+        columns = exact(L[np.ix_(rows, pivots)] / scale[rows, None])
+        gram = (columns * columns.transpose()).entries()
+        for place, entry in zip(product(rows, rows), gram, strict=True):
+            entries[place] = entries.get(place, 0) - entry
+    return Sign(proved=dominant(entries, scale), refuted=False, least=least)
+
+
+def by_eigenvectors(S: arb_mat, sizes: Array) -> Sign:
+    """The sign of one block.
+
+    Floats find a congruence, balls prove: X holds the eigenvectors of the scaled midpoints, and G = X'SX is nearly
+    diagonal. If G is positive definite, so is S: X is then regular, for Xv = 0 gives v'Gv = 0. If some G_ii < 0, that
+    column x of X has x'Sx < 0.
+    """
+    scale = _scale(sizes)
+    with np.errstate(all="ignore"):  # what overflows is left undecided
+        middle = floats(S) * scale * scale[:, None]
+    if not np.isfinite(middle).all():
+        return UNDECIDED
+    X = exact(scale[:, None] * np.linalg.eigh(middle)[1])
+    G = X.transpose() * (S * X)
+    on_diagonal = diagonal(G)
+    least = float(on_diagonal.min())
+    if not np.isfinite(on_diagonal).all():
+        return UNDECIDED
+    if not least > 0.0:
+        return Sign(proved=False, refuted=any(G[i, i] < 0 for i in range(G.nrows())), least=least)
+    return Sign(proved=dominant(nonzero(G), on_diagonal**-0.5), refuted=False, least=least)
+
+
+def _scale(sizes: Array) -> Array:
+    """What makes the sizes about 1 from both sides; powers of two scale exactly."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.exp2(np.round(-np.log2(np.where(sizes > 0.0, sizes, 1.0)) / 2.0)))
+
+
+def dominant(entries: Entries, d: Array) -> bool:
+    """Whether G_ii d_i > sum over j != i of |G_ij| d_j for every row i of a symmetric G; d > 0.
+
+    Then diag(d) G diag(d) is strictly diagonally dominant, so G is positive definite by Gershgorin's theorem.
+    """
+    magnitudes, weights = arb_mat(len(d), len(d)), exact(d[:, None])
+    for place, entry in entries.items():
+        magnitudes[place] = abs(entry)
+    sums = magnitudes * weights  # |G_ii| d_i is among the sum
+    return all(2 * entries.get((i, i), 0) * weights[i, 0] > sums[i, 0] for i in range(len(d)))
+
+
+def nonzero(matrix: arb_mat) -> Entries:
+    """The entries that are not exactly 0, by row and column."""
+    places = product(range(matrix.nrows()), range(matrix.ncols()))
+    return {place: entry for place, entry in zip(places, matrix.entries(), strict=True) if not entry.is_zero()}
+
+
+def fronts(joined: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
+    """An order of elimination that keeps a Cholesky factor sparse: pivots, and what they are joined with of the rest.
+
+    Those of least degree are next, and all that is left is last, as soon as its least degree is no longer small.
+    """
+    joined = joined | joined.T | np.eye(len(joined), dtype=bool)
+    degree, left = joined.sum(axis=1), np.ones(len(joined), dtype=bool)
+    found: list[tuple[list[int], list[int]]] = []
+    while left.any():
+        row = joined[np.where(left, degree, len(joined) + 1).argmin()].copy()
+        if _FEW * row.sum() > left.sum():
+            found.append((np.flatnonzero(left).tolist(), []))
+            break
+        near = np.flatnonzero(row)
+        alike = (joined[near] == row).all(axis=1)
+        pivots, border = near[alike], near[~alike]
+        found.append((pivots.tolist(), border.tolist()))
+        joined[np.ix_(border, border)] = True
+        joined[:, pivots] = left[pivots] = False
+        degree[border] = joined[border].sum(axis=1)
+    return found
 
 
 def filled(matrix: arb_mat) -> NDArray[np.bool_]:
@@ -77,6 +196,8 @@ def filled(matrix: arb_mat) -> NDArray[np.bool_]:
 
 def blocks(S: arb_mat) -> list[list[int]]:
     """The indices of a square matrix, in sets between which every entry is exactly 0."""
+    if not any(S[0, j].is_zero() for j in range(S.ncols())):  # most matrices do not fall apart
+        return [list(range(S.ncols()))]
     joined = filled(S)
     joined |= joined.T
     left, found = np.ones(len(joined), dtype=bool), []
@@ -89,34 +210,6 @@ def blocks(S: arb_mat) -> list[list[int]]:
         left &= ~block
         found.append(np.flatnonzero(block).tolist())
     return found
-
-
-def _sign(S: arb_mat, sizes: Array) -> Sign:
-    """The sign of one block.
-
-    Floats find a congruence, balls prove: X holds the eigenvectors of the scaled midpoints, and G = X'SX is nearly
-    diagonal. If there are d > 0 with G_ii d_i > sum over j != i of |G_ij| d_j for every i, then diag(d) G diag(d) is
-    strictly diagonally dominant, so G is positive definite by Gershgorin's theorem. X is then regular, for Xv = 0
-    gives v'Gv = 0; so S is positive definite too. If some G_ii < 0, that column x of X has x'Sx < 0.
-    """
-    with np.errstate(all="ignore"):  # what overflows is left undecided
-        scale = np.exp2(np.round(-np.log2(np.where(sizes > 0.0, sizes, 1.0)) / 2.0))  # powers of two scale exactly
-        middle = floats(S) * scale * scale[:, None]
-    if not np.isfinite(middle).all():
-        return UNDECIDED
-    X = exact(scale[:, None] * np.linalg.eigh(middle)[1])
-    G = X.transpose() * (S * X)
-    order = G.nrows()
-    diagonal = [G[i, i] for i in range(order)]
-    least = min(float(entry) for entry in diagonal)
-    if not np.isfinite(least):
-        return UNDECIDED
-    if not least > 0.0:
-        return Sign(proved=False, refuted=any(entry < 0 for entry in diagonal), least=least)
-    d = exact(np.array([[float(entry) ** -0.5] for entry in diagonal]))
-    rows = arb_mat(order, order, [abs(entry) for entry in G.entries()]) * d  # |G_ii| d_i is among the sum
-    dominant = all(2 * G[i, i] * d[i, 0] > rows[i, 0] for i in range(order))
-    return Sign(proved=dominant, refuted=False, least=least)
 
 
 def above(Y: arb_mat) -> arb_mat:

@@ -19,7 +19,7 @@ from agent.contract.errors import InputError, listed
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.ball_model import BallModel
-from designer.balls import Sign, add, exact, floats, identity, sign
+from designer.balls import Sign, diagonal, exact, sign
 
 BITS = (128, 256, 512, 1024)  # carried one after the other, until every inequality is proved or one proved false
 MOST_STEPS = 1_000_000  # of a recursion that is proved; designs need fewer even where errors hardly decay
@@ -66,32 +66,31 @@ def check(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, P: Array, gamma
     """Theorem 1 for the gains of (5), P (modes, n_eta, n_eta) and gamma."""
 
     def findings() -> list[Finding]:
-        model, P_balls, modes = BallModel(problem, K, H), symmetric(P), problem.mode_names
-        return inequality_17(model, modes, P_balls) + _inequality_18(model, modes, P_balls, gamma)
+        model, modes = BallModel(problem, K, H), problem.mode_names
+        return inequality_17(model, modes, P) + _inequality_18(model, modes, P, gamma)
 
     return decided(findings, gamma)
 
 
-def inequality_17(model: BallModel, modes: tuple[str, ...], P: list[arb_mat]) -> list[Finding]:
+def inequality_17(model: BallModel, modes: tuple[str, ...], P: Array) -> list[Finding]:
     """diag{P(s), I} - [A B]'P_bar[A B] - noise > 0: minus the matrix of (17)."""
+    weighed = np.tile(np.eye(model.size + model.nw), (len(modes), 1, 1))
+    weighed[:, : model.size, : model.size] = P
     found = []
-    for mode, P_s, S in zip(modes, P, model.joint(P), strict=True):
-        S = -S
-        add(S, model.eta, model.eta, P_s)
-        add(S, model.w, model.w, identity(model.nw))
-        found.append(Finding("(17)", mode, sign(S, np.append(floats(P_s).diagonal(), np.ones(model.nw)))))
+    for mode, S, whole in zip(modes, model.joint(symmetric(P)), symmetric(weighed), strict=True):
+        found.append(Finding("(17)", mode, sign(whole - S, diagonal(whole))))
     return found
 
 
-def _inequality_18(model: BallModel, modes: tuple[str, ...], P: list[arb_mat], gamma: float) -> list[Finding]:
+def _inequality_18(model: BallModel, modes: tuple[str, ...], P: Array, gamma: float) -> list[Finding]:
     """P(s) - M'M / gamma^2 > 0: (18), by the Schur complement; (32)."""
     MM = model.MM * (1 / arb(gamma) ** 2)
-    return [Finding("(18)", mode, sign(P_s - MM, floats(P_s).diagonal())) for mode, P_s in zip(modes, P, strict=True)]
+    return [Finding("(18)", mode, sign(P_s - MM, diagonal(P_s))) for mode, P_s in zip(modes, symmetric(P), strict=True)]
 
 
 def symmetric(P: Array) -> list[arb_mat]:
     """(P + P')/2 of every mode, as x'Px sees P."""
-    return [(exact(P_s) + exact(P_s.T)) * arb(0.5) for P_s in P]
+    return [exact(P_s) if (P_s == P_s.T).all() else (exact(P_s) + exact(P_s.T)) * arb(0.5) for P_s in P]
 
 
 def decided(findings: Callable[[], list[Finding]], gamma: float) -> Verdict:

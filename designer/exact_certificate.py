@@ -21,7 +21,7 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.ball_model import BallModel
-from designer.balls import UNDECIDED, Sign, above, below, floats, identity, part, sign
+from designer.balls import UNDECIDED, Sign, above, below, diagonal, floats, identity, part, sign
 from designer.certificate import Finding, Verdict, decided, inequality_17, symmetric
 
 Modes = tuple[str, ...]
@@ -36,10 +36,8 @@ def check_exact(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, P: Array,
 
     def findings() -> list[Finding]:
         model, P_balls, modes, gamma2 = BallModel(problem, K, H), symmetric(P), problem.mode_names, arb(gamma) ** 2
-        found = inequality_17(model, modes, P_balls)
-        found += [
-            Finding("P > 0", mode, sign(P_s, floats(P_s).diagonal())) for mode, P_s in zip(modes, P_balls, strict=True)
-        ]
+        found = inequality_17(model, modes, P)
+        found += [Finding("P > 0", mode, sign(P_s, diagonal(P_s))) for mode, P_s in zip(modes, P_balls, strict=True)]
         if not _proved(found):
             return found
         tail, tau2 = _tail(model, modes, P_balls, gamma2, horizon)
@@ -110,7 +108,7 @@ def _powers(model: BallModel, horizon: int, rounded: Rounding) -> list[arb_mat]:
 def _less(Z: arb_mat, tau2: arb, P: arb_mat) -> Sign:
     """The sign of tau^2 P - Z."""
     bound = P * tau2
-    return sign(bound - Z, floats(bound).diagonal())
+    return sign(bound - Z, diagonal(bound))
 
 
 def _relative(Z: list[arb_mat], P: list[arb_mat]) -> float:
