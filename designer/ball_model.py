@@ -16,10 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 from flint import arb, arb_mat
+from numpy.typing import NDArray
 
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.balls import add, blocks, exact, filled, identity, part
+from designer.balls import add, exact, identity, part
 
 
 class Noise(NamedTuple):
@@ -62,12 +63,16 @@ class BallModel:
             self.transition.append([arb(pi) / total for pi in row])
         self.sensors = [self._sensor(problem, j) for j in range(n)]
         self.AB: list[arb_mat] = []  # (n_eta, n_eta + nw), of every mode
+        self.filled: list[NDArray[np.bool_]] = []  # where AB may be other than exactly 0
         self.noise: list[list[Noise]] = []
         for s in range(len(problem.topologies)):
-            AB, noise = self._mode(problem, s, K, H)
-            self.AB.append(AB)
-            self.noise.append(noise)
-        self.filled = [filled(AB) for AB in self.AB]
+            self.AB.append(arb_mat(self.size, self.size + self.nw))
+            self.filled.append(np.zeros((self.size, self.size + self.nw), dtype=bool))
+            self.noise.append(self._mode(problem, s, K, H))
+
+    def _add(self, s: int, rows: list[int], columns: list[int], block: arb_mat) -> None:
+        add(self.AB[s], rows, columns, block)
+        self.filled[s][np.ix_(rows, columns)] = True
 
     def _sensor(self, problem: Problem, j: int) -> Sensor:
         node = problem.nodes[j]
@@ -80,15 +85,15 @@ class BallModel:
             add(lost, range(ny), range(problem.nx, problem.nx + problem.nw), D)
         return Sensor(C * beta, D * beta if node.seen else D, beta * (1 - beta), columns, lost)
 
-    def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> tuple[arb_mat, list[Noise]]:
-        """[A B] and the noise of mode s; K and H have the weights a_ij within from here on."""
+    def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> list[Noise]:
+        """Fill in [A B] of mode s; its noise. K and H have the weights a_ij within from here on."""
         A, B, nx = exact(problem.plant.A), exact(problem.plant.B), problem.nx
         topology, names, heard = problem.topologies[s], problem.node_names, problem.neighbours
-        AB, noise = arb_mat(self.size, self.size + self.nw), []
+        noise = []
         carried: list[list[tuple[list[int], arb_mat]]] = [[] for _ in names]  # of j: where its innovation goes, and how
         if self.x:
-            add(AB, self.x, self.x, A)
-            add(AB, self.x, self.w, B)
+            self._add(s, self.x, self.x, A)
+            self._add(s, self.x, self.w, B)
         for i, receiver in enumerate(names):
             weights = {j: arb(topology.adjacency[i, j].item()) for j in heard(s, i)}
             K_i = {j: exact(K[topology.name][receiver][names[j]]) * a_ij for j, a_ij in weights.items()}
@@ -97,23 +102,23 @@ class BallModel:
             if problem.unbiased:
                 K_i[i] = A - others  # what the node steps by; the file has it rounded
             elif self.x:
-                add(AB, self.e[i], self.x, A - others - K_i[i])
-            add(AB, self.e[i], self.w, B)
+                self._add(s, self.e[i], self.x, A - others - K_i[i])
+            self._add(s, self.e[i], self.w, B)
             for j in weights:
                 sensor, rho = self.sensors[j], arb(problem.delivery[i, j].item())
                 by_e, by_w = K_i[j] - H_i[j] * sensor.C_mean, -(H_i[j] * sensor.D_mean)
-                add(AB, self.e[i], self.e[j], by_e * rho)
-                add(AB, self.e[i], self.w, by_w * rho)
+                self._add(s, self.e[i], self.e[j], by_e * rho)
+                self._add(s, self.e[i], self.w, by_w * rho)
                 carried[j].append((self.e[i], H_i[j] * -rho))
                 if rho == 1:
                     continue
-                add(AB, self.e[i], self.e[i], K_i[j] * (1 - rho))
+                self._add(s, self.e[i], self.e[i], K_i[j] * (1 - rho))
                 lossy = rho * (1 - rho)
                 noise.append(self._of_link(i, j, lossy, K_i[j], by_e, by_w))
                 if sensor.alpha > 0:
                     noise.append(Noise(lossy * sensor.alpha, self.e[i], -H_i[j], sensor.columns, sensor.lost))
         noise += [self._of_sensor(j, carried[j]) for j in range(problem.n) if self.sensors[j].alpha > 0]
-        return AB, noise
+        return noise
 
     def _of_link(self, i: int, j: int, variance: arb, K_ij: arb_mat, by_e: arb_mat, by_w: arb_mat) -> Noise:
         """A message that arrives: K_ij (e_j - e_i) less H_ij times node j's mean innovation, in e_i."""
@@ -147,24 +152,25 @@ class BallModel:
             add(MM, e_i, e_i, M_i.transpose() * M_i)
         return MM
 
-    def joint(self, Y: list[arb_mat]) -> list[arb_mat]:
+    def joint(self, Y: list[arb_mat], found: list[list[int]] | None = None) -> list[arb_mat]:
         """E|eta+|^2 weighed by Y(t), t the next mode, as a quadratic form in [eta; w], for every mode.
 
-        [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw).
+        [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw). `found`: the
+        blocks of every Y(t), where they are known; else it is taken as one.
         """
-        return [self._joint(s, Y) for s in self.modes]
+        return [self._joint(s, Y, found or [self.eta]) for s in self.modes]
 
-    def _joint(self, s: int, Y: list[arb_mat]) -> arb_mat:
+    def _joint(self, s: int, Y: list[arb_mat], found: list[list[int]]) -> arb_mat:
         Y_bar = sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
-        S = self._mean(s, Y_bar)
+        S = self._mean(s, Y_bar, found)
         for noise in self.noise[s]:
             core = noise.E.transpose() * part(Y_bar, noise.rows, noise.rows) * noise.E
             add(S, noise.columns, noise.columns, noise.C.transpose() * core * noise.C * noise.variance)
         return S
 
-    def _mean(self, s: int, Y_bar: arb_mat) -> arb_mat:
+    def _mean(self, s: int, Y_bar: arb_mat, found: list[list[int]]) -> arb_mat:
         """[A B]'Y_bar[A B], by the blocks of Y_bar: those of a P = diag{R, Q_1, ...} meet few columns of [A B] each."""
-        AB, found = self.AB[s], blocks(Y_bar)
+        AB = self.AB[s]
         if len(found) == 1:
             return AB.transpose() * (Y_bar * AB)
         S = arb_mat(AB.ncols(), AB.ncols())

@@ -70,14 +70,20 @@ def add(matrix: arb_mat, rows: Sequence[int], columns: Sequence[int], block: arb
 def sign(S: arb_mat, sizes: Array) -> Sign:
     """Whether the exact symmetric matrix within S is positive definite; sizes: what its diagonal is measured by.
 
-    What Cholesky does not prove is looked at by eigenvectors, which are slower and see further: block by block, where
-    S falls apart, as (18) does by nodes.
+    What Cholesky does not prove is looked at by eigenvectors, which are slower and see further.
     """
     if S.nrows() > _SMALL:
         found = by_cholesky(S, sizes)
         if found.proved:
             return found
-    signs = [by_eigenvectors(part(S, block, block), sizes[block]) for block in blocks(S)]
+    joined = np.zeros((S.nrows(), S.nrows()), dtype=bool)
+    for place in nonzero(S):
+        joined[place] = True
+    return of_blocks([by_eigenvectors(part(S, block, block), sizes[block]) for block in blocks(joined)])
+
+
+def of_blocks(signs: list[Sign]) -> Sign:
+    """The sign of a matrix that falls apart into blocks of these signs."""
     return Sign(
         proved=all(each.proved for each in signs),
         refuted=any(each.refuted for each in signs),
@@ -189,17 +195,9 @@ def fronts(joined: NDArray[np.bool_]) -> list[tuple[list[int], list[int]]]:
     return found
 
 
-def filled(matrix: arb_mat) -> NDArray[np.bool_]:
-    """Which entries are not exactly 0."""
-    return np.array([not entry.is_zero() for entry in matrix.entries()]).reshape(matrix.nrows(), matrix.ncols())
-
-
-def blocks(S: arb_mat) -> list[list[int]]:
-    """The indices of a square matrix, in sets between which every entry is exactly 0."""
-    if not any(S[0, j].is_zero() for j in range(S.ncols())):  # most matrices do not fall apart
-        return [list(range(S.ncols()))]
-    joined = filled(S)
-    joined |= joined.T
+def blocks(joined: NDArray[np.bool_]) -> list[list[int]]:
+    """The indices of a square matrix, in sets between which nothing is joined."""
+    joined = joined | joined.T
     left, found = np.ones(len(joined), dtype=bool), []
     while left.any():
         block = np.zeros(len(joined), dtype=bool)

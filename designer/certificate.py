@@ -19,7 +19,7 @@ from agent.contract.errors import InputError, listed
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.ball_model import BallModel
-from designer.balls import Sign, diagonal, exact, sign
+from designer.balls import Sign, blocks, diagonal, exact, of_blocks, part, sign
 
 BITS = (128, 256, 512, 1024)  # carried one after the other, until every inequality is proved or one proved false
 MOST_STEPS = 1_000_000  # of a recursion that is proved; designs need fewer even where errors hardly decay
@@ -77,7 +77,7 @@ def inequality_17(model: BallModel, modes: tuple[str, ...], P: Array) -> list[Fi
     weighed = np.tile(np.eye(model.size + model.nw), (len(modes), 1, 1))
     weighed[:, : model.size, : model.size] = P
     found = []
-    for mode, S, whole in zip(modes, model.joint(symmetric(P)), symmetric(weighed), strict=True):
+    for mode, S, whole in zip(modes, model.joint(symmetric(P), _blocks(model, P)), symmetric(weighed), strict=True):
         found.append(Finding("(17)", mode, sign(whole - S, diagonal(whole))))
     return found
 
@@ -85,7 +85,20 @@ def inequality_17(model: BallModel, modes: tuple[str, ...], P: Array) -> list[Fi
 def _inequality_18(model: BallModel, modes: tuple[str, ...], P: Array, gamma: float) -> list[Finding]:
     """P(s) - M'M / gamma^2 > 0: (18), by the Schur complement; (32)."""
     MM = model.MM * (1 / arb(gamma) ** 2)
-    return [Finding("(18)", mode, sign(P_s - MM, diagonal(P_s))) for mode, P_s in zip(modes, symmetric(P), strict=True)]
+    found, blocks_of_P = [], _blocks(model, P)
+    for mode, P_s in zip(modes, symmetric(P), strict=True):
+        S, sizes = P_s - MM, diagonal(P_s)
+        signs = [sign(part(S, block, block), sizes[block]) for block in blocks_of_P]
+        found.append(Finding("(18)", mode, of_blocks(signs)))
+    return found
+
+
+def _blocks(model: BallModel, P: Array) -> list[list[int]]:
+    """The blocks of P(s), the same for every mode; the states of a node, which M'M may join, stay together."""
+    joined = (P != 0.0).any(axis=0)
+    for e_i in model.e:
+        joined[np.ix_(e_i, e_i)] = True
+    return blocks(joined)
 
 
 def symmetric(P: Array) -> list[arb_mat]:

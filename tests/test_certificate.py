@@ -24,7 +24,7 @@ from designer import balls, certificate, exact_certificate
 from designer.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.ball_model import BallModel, Noise, Sensor
 from designer.balls import above, below, exact, floats, sign
-from designer.certificate import check, lyapunov_matrix, verify
+from designer.certificate import check, lyapunov_matrix, symmetric, verify
 from designer.cli import main
 from designer.consensus import consensus_gains
 from designer.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
@@ -409,10 +409,10 @@ def forgetful(kept: str) -> type[BallModel]:
             sensor = super()._sensor(problem, j)
             return sensor if kept == "losses" else sensor._replace(alpha=arb(0))
 
-        def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> tuple[arb_mat, list[Noise]]:
-            AB, noise = super()._mode(problem, s, K, H)
+        def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> list[Noise]:
+            noise = super()._mode(problem, s, K, H)
             of_sensors = sum(sensor.alpha > 0 for sensor in self.sensors)  # they come last
-            return AB, noise if kept == "links" else noise[len(noise) - of_sensors :]
+            return noise if kept == "links" else noise[len(noise) - of_sensors :]
 
     return Forgetful
 
@@ -460,6 +460,46 @@ def test_both_error_models_are_one(variant: dict[str, Any]) -> None:
     np.testing.assert_allclose(joint, operator.joint(operator.bar(Y)), rtol=0, atol=1e-13 * np.abs(joint).max())
     np.testing.assert_allclose([floats(AB) for AB in ball_model.AB], operator.AB, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(floats(ball_model.M), model.M)
+
+
+def partly_joined(problem: Problem) -> Array:
+    """P = diag{R, Q_1(s), ...} with diagonal blocks, but for one entry that joins the first two nodes in one mode."""
+    p, nx = problem.plant_states, problem.nx
+    P = np.tile(2.0 * np.eye(p + problem.n * nx), (len(problem.mode_names), 1, 1))
+    P[-1, p, p + nx] = P[-1, p + nx, p] = 0.5
+    return P
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_the_blocks_of_P_change_nothing(variant: dict[str, Any]) -> None:
+    """What is summed by the blocks of P is what the whole matrix gives; that of other blocks differs."""
+    problem = real_network(random_problem(7, n=4), **variant)
+    zero = np.zeros((2, problem.n * problem.nx, problem.n * problem.nx))
+    model = BallModel(problem, *link_gains(problem, zero + 0.1, random_gains(problem, 7)[1]))
+    P = partly_joined(problem)
+    P_balls, found = symmetric(P), certificate._blocks(model, P)
+    joined = [block for block in found if model.e[0][0] in block]
+    assert joined == [model.e[0] + model.e[1]]
+    assert sorted(k for block in found for k in block) == model.eta
+    whole, by_blocks = model.joint(P_balls), model.joint(P_balls, found)
+    assert all(a.overlaps(b) for a, b in zip(whole, by_blocks, strict=True))
+    wrong = model.joint(P_balls, [[k] for k in model.eta])
+    assert not all(a.overlaps(b) for a, b in zip(whole, wrong, strict=True))
+    assert all(((AB != 0.0) <= filled).all() for AB, filled in zip(map(floats, model.AB), model.filled, strict=True))
+
+
+def test_18_sees_what_joins_the_states_of_a_node() -> None:
+    """Every diagonal entry of P is above that of M'M / gamma^2, and P is not above it."""
+    document = find("two-nodes").document()
+    document["plant"].update(A=[[0.5, 0.0], [0.0, 0.5]], B=[[1.0], [1.0]], M=[[1.0, 1.0]])
+    for node in document["node"]:
+        node.update(C=[[1.0, 0.0]], D=[[1.0]])
+    problem = Problem.from_document(document)
+    zero = np.zeros((1, 4, 4))
+    model = BallModel(problem, *link_gains(problem, zero, zero[:, :, :2]))
+    for p, proved in ((1.5, False), (2.5, True)):
+        (finding,) = certificate._inequality_18(model, problem.mode_names, p * np.eye(6)[None], 1.0)
+        assert (finding.sign.proved, finding.sign.refuted) == (proved, not proved)
 
 
 # signs
