@@ -152,29 +152,29 @@ class BallModel:
             add(MM, e_i, e_i, M_i.transpose() * M_i)
         return MM
 
-    def joint(self, Y: list[arb_mat], found: list[list[int]] | None = None) -> list[arb_mat]:
+    def joint(self, Y: list[arb_mat], partition: list[list[int]] | None = None) -> list[arb_mat]:
         """E|eta+|^2 weighed by Y(t), t the next mode, as a quadratic form in [eta; w], for every mode.
 
-        [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw). `found`: the
+        [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw). `partition`: the
         blocks of every Y(t), where they are known; else it is taken as one.
         """
-        return [self._joint(s, Y, found or [self.eta]) for s in self.modes]
+        return [self._joint(s, Y, partition or [self.eta]) for s in self.modes]
 
-    def _joint(self, s: int, Y: list[arb_mat], found: list[list[int]]) -> arb_mat:
+    def _joint(self, s: int, Y: list[arb_mat], partition: list[list[int]]) -> arb_mat:
         Y_bar = sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
-        S = self._mean(s, Y_bar, found)
+        S = self._mean(s, Y_bar, partition)
         for noise in self.noise[s]:
             core = noise.E.transpose() * part(Y_bar, noise.rows, noise.rows) * noise.E
             add(S, noise.columns, noise.columns, noise.C.transpose() * core * noise.C * noise.variance)
         return S
 
-    def _mean(self, s: int, Y_bar: arb_mat, found: list[list[int]]) -> arb_mat:
+    def _mean(self, s: int, Y_bar: arb_mat, partition: list[list[int]]) -> arb_mat:
         """[A B]'Y_bar[A B], by the blocks of Y_bar: those of a P = diag{R, Q_1, ...} meet few columns of [A B] each."""
         AB = self.AB[s]
-        if len(found) == 1:
+        if len(partition) == 1:
             return AB.transpose() * (Y_bar * AB)
         S = arb_mat(AB.ncols(), AB.ncols())
-        for rows in found:
+        for rows in partition:
             columns = np.flatnonzero(self.filled[s][rows].any(axis=0)).tolist()
             AB_rows = part(AB, rows, columns)
             add(S, columns, columns, AB_rows.transpose() * (part(Y_bar, rows, rows) * AB_rows))

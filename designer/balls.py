@@ -30,7 +30,7 @@ Entries = dict[tuple[int, int], arb]  # by row and column; the others are exactl
 
 _RESOLVED = 1e-12  # floats know an eigenvalue this far above 0, of a matrix with about 1 on its diagonal
 _SMALL = 16  # up to this order eigenvectors are as fast
-_FEW = 8  # a row is sparse while it has at most one in so many entries
+_FEW = 8  # a row is sparse if at most one in so many of its entries is filled
 
 
 def exact(matrix: Array) -> arb_mat:

@@ -10,7 +10,7 @@ from flint import arb, arb_mat, ctx
 
 from agent.contract.arrays import Array
 from designer import balls
-from designer.balls import by_cholesky, by_eigenvectors, exact, fronts, sign
+from designer.balls import blocks, by_cholesky, by_eigenvectors, exact, fronts, sign
 
 ORDER = 60
 
@@ -166,6 +166,14 @@ def test_every_index_is_eliminated_once_and_the_factor_is_zero_elsewhere(density
     for pivots, border in found:
         L[np.ix_([*pivots, *border], pivots)] = 0.0
     assert not L.any()
+
+
+@pytest.mark.parametrize("lower", [False, True])
+def test_blocks_are_joined_by_an_entry_on_either_side(lower: bool) -> None:
+    """As in a P that is stored as a triangle: x'Px sees its symmetric part."""
+    joined = np.eye(4, dtype=bool)
+    joined[0, 2] = True
+    assert blocks(joined.T if lower else joined) == [[0, 2], [1], [3]]
 
 
 def test_a_network_is_eliminated_node_by_node() -> None:
