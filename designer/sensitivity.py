@@ -16,7 +16,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.error_model import ErrorModel, LinkTerms, error_model, stacks
-from designer.gain import Operator, horizon_gain, horizon_holds
+from designer.gain import Operator, horizon_gain, horizon_holds, step
 
 
 class Sweep(NamedTuple):
@@ -29,23 +29,16 @@ class Sweep(NamedTuple):
 
 
 def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
-    """Y <- A'Y_bar A + A'Y_bar B W^-1 B'Y_bar A from M'M, W = g I - B'Y_bar B; None where a W is not positive."""
-    Y, size, log_det = operator.MM, operator.size, 0.0
-    shape = (horizon, len(Y))
-    Y_bars = np.empty((*shape, size, size))
-    Gammas, inverses = np.empty((*shape, operator.nw, size)), np.empty((*shape, operator.nw, operator.nw))
+    """The steps from M'M; None where a W is not positive definite."""
+    Y, log_det, shape = operator.MM, 0.0, (horizon, len(operator.MM))
+    Y_bars = np.empty((*shape, operator.size, operator.size))
+    Gammas, inverses = np.empty((*shape, operator.nw, operator.size)), np.empty((*shape, operator.nw, operator.nw))
     for k in range(horizon):
-        Y_bars[k] = operator.bar(Y)
-        S = operator.joint(Y_bars[k])
-        try:
-            L = np.linalg.cholesky(operator.eye_w - S[:, size:, size:] / g)
-        except np.linalg.LinAlgError:
+        taken = step(operator, Y, g)
+        if taken is None:
             return None
-        log_det += 2.0 * float(np.log(L.diagonal(axis1=1, axis2=2)).sum())
-        L_inverse = np.linalg.inv(L)
-        inverses[k] = L_inverse.swapaxes(1, 2) @ L_inverse / g
-        Gammas[k] = inverses[k] @ S[:, size:, :size]
-        Y = S[:, :size, :size] + S[:, :size, size:] @ Gammas[k]
+        Y_bars[k], inverses[k], Gammas[k], Y = taken.Y_bar, taken.W_inverse, taken.Gamma, taken.Y
+        log_det += float(taken.log_det.sum())
     return Sweep(Y_bars, Gammas, inverses, log_det)
 
 
@@ -162,7 +155,7 @@ def critical_sweep(operator: Operator, horizon: int) -> tuple[float, Sweep]:
         first, last = (middle, last) if holds else (first, middle)
     _, g = horizon_gain(operator, last, width=1e-13)
     swept, above = sweep(operator, g, last), 1e-14
-    while swept is None:  # the recursion held at g, but the sweep rounds in another order
+    while swept is None:  # the recursion held at g, but BLAS may round in another order
         above *= 2.0
         swept = sweep(operator, g * (1.0 + above), last)
     return g, swept

@@ -10,6 +10,8 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from benchmarks.design import banded
+from designer.consensus import consensus_gains
 from designer.error_model import error_model, link_gains, paper_error_model, realised, stacks, step
 from designer.gain import Operator
 
@@ -205,6 +207,33 @@ def test_the_mean_over_all_losses_is_what_the_operator_says(real: Network) -> No
             AB = realised(model, s, theta, delivered)
             expected += chance * AB.T @ P_bar[s] @ AB
         np.testing.assert_allclose(joint[s], expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
+
+
+def zeros_may_be_left_out(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`Operator.joint` is the same with sparse and with full matrices, for nodes with one and two measurements."""
+    model = error_model(*network)
+    factor = np.random.default_rng(6).normal(size=(model.modes, model.size, model.size))
+    Y_bar, joints = factor @ factor.swapaxes(1, 2), []
+    for share in (0.0, 2.0):
+        monkeypatch.setattr("designer.gain._SPARSE", share)
+        operator = Operator(model)
+        assert (operator.sparse is None) == (share == 0.0)
+        joints.append(operator.joint(Y_bar))
+    np.testing.assert_allclose(*joints, rtol=1e-11, atol=1e-11 * np.abs(joints[0]).max())
+
+
+def test_the_zeros_of_large_networks_may_be_left_out(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    zeros_may_be_left_out(network, monkeypatch)
+
+
+def test_and_of_real_networks_too(real: Network, monkeypatch: pytest.MonkeyPatch) -> None:
+    zeros_may_be_left_out(real, monkeypatch)
+
+
+def test_networks_of_40_nodes_are_sparse_and_those_of_4_are_not() -> None:
+    for n, sparse in ((4, False), (40, True)):
+        problem = banded(n, seed=1)
+        assert (Operator(error_model(problem, *consensus_gains(problem))).sparse is not None) == sparse
 
 
 def test_the_noises_have_mean_0_and_the_matrices_that_the_model_names(real: Network) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from designer.consensus import consensus_gains, least_variance_gains
 from designer.error_model import ErrorModel, error_model, link_gains, paper_error_model, realised
 from designer.exact_certificate import check_exact
 from designer.floor import floor
-from designer.gain import Operator, exact_gain, horizon_gain
+from designer.gain import InvariantSet, Operator, exact_gain, horizon_gain, horizon_holds, step
 from designer.problems import find
 from designer.sensitivity import gain_slope
 from designer.worst_case import Policy, path_gain, worst_disturbance, worst_policy
@@ -208,6 +209,60 @@ def test_the_interval_closes_on_what_longer_horizons_show(case: Case) -> None:
     assert gain.low * (1.0 - 1e-9) <= gamma_T(model, 400, width=4e-7) <= gain.high * (1.0 + 4e-7)
     assert 0.0 < gain.high - gain.low <= 1e-6 * gain.high
     assert gain.stable
+
+
+@pytest.mark.parametrize("case", [*CASES, *REAL])
+def test_a_sweep_that_ends_in_the_invariant_set_ends_as_a_long_one_does(case: Case) -> None:
+    """At every g the answer is that of 400 steps; and (17) for a larger P would be false, so a larger set is none."""
+    model = error_model(*case)
+    operator, gain = Operator(model), exact_gain(model)
+    assert gain.P is not None
+    invariant, larger = InvariantSet(gain.P), InvariantSet(1e6 * gain.P)
+    g = gain.low**2
+    for factor in (0.5, 0.9, 1.0 - 1e-3, 1.0 - 1e-6, 1.0 + 2e-6, 1.0 + 1e-3, 1.1, 2.0, 10.0):
+        early, _ = horizon_holds(operator, factor * g, 400, invariant=invariant)
+        assert early == horizon_holds(operator, factor * g, 400)[0] == (factor > 1.0)
+    assert horizon_holds(operator, g * (1.0 - 1e-3), 400, invariant=larger)[0]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_invariant_set_has_all_Y_up_to_gP_that_it_says_it_has(case: Case) -> None:
+    """One step from g P leads to no more than g P; what the set contains is below g P in every direction."""
+    model = error_model(*case)
+    P = exact_gain(model).P
+    assert P is not None
+    invariant, operator, rng = InvariantSet(P), Operator(model), np.random.default_rng(0)
+    taken = step(operator, 3.0 * P, 3.0)
+    assert taken is not None
+    assert np.linalg.eigvalsh(3.0 * P - taken.Y).min() > 0.0
+    for _ in range(20):
+        factor = rng.normal(size=P.shape)
+        Y = factor @ factor.swapaxes(1, 2)
+        assert not invariant.contains(Y, 0.999 * float(np.linalg.eigvals(np.linalg.solve(P, Y)).real.max()))
+        g = 1.001 * float(np.trace(np.linalg.solve(P, Y), axis1=1, axis2=2).sum())
+        assert invariant.contains(Y, g)
+        assert np.linalg.eigvalsh(g * P - Y).min() > 0.0
+
+
+@pytest.mark.parametrize("case", [random_case(2, nw=1), lossy_example()])
+def test_a_disturbance_that_moves_nothing_changes_nothing(case: Case) -> None:
+    """One w: its W are numbers, and nothing is factored. With a second that has no effect they are matrices."""
+    model = error_model(*case)
+    none = np.zeros((model.modes, model.size, 1))
+    more = replace(
+        model, B=np.concatenate([model.B, none], axis=2), R=np.hstack([model.R, np.zeros((len(model.R), 1))])
+    )
+    assert (model.nw, more.nw) == (1, 2)
+    gain, other = exact_gain(model), exact_gain(more)
+    assert gain.horizon == other.horizon
+    assert (gain.low, gain.high, gain.tail) == pytest.approx((other.low, other.high, other.tail), rel=1e-6)
+
+
+def test_errors_that_nothing_moves_have_the_gain_0() -> None:
+    model = error_model(*lossy_example())
+    gain = exact_gain(replace(model, M=np.zeros_like(model.M)))
+    assert gain.low == 0.0
+    assert gain.high < 1e-150
 
 
 @pytest.mark.parametrize("case", CASES)
