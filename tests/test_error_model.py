@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -210,9 +211,11 @@ def test_the_mean_over_all_losses_is_what_the_operator_says(real: Network) -> No
 
 
 def zeros_may_be_left_out(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`Operator.joint` is the same with sparse and with full matrices, for nodes with one and two measurements."""
-    model = error_model(*network)
-    factor = np.random.default_rng(6).normal(size=(model.modes, model.size, model.size))
+    """`Operator.joint` is the same with sparse and with full matrices, wherever the zeros are."""
+    model, rng = error_model(*network), np.random.default_rng(6)
+    H, R = (np.where(rng.uniform(size=full.shape) < 0.5, 0.0, full) for full in (model.H, model.R))
+    model = replace(model, H=H, R=R)
+    factor = rng.normal(size=(model.modes, model.size, model.size))
     Y_bar, joints = factor @ factor.swapaxes(1, 2), []
     for share in (0.0, 2.0):
         monkeypatch.setattr("designer.gain._SPARSE", share)
