@@ -28,7 +28,7 @@ WHO_MAY_IMPORT = {
     "zstandard": ["agent/contract/recording.py"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": ["designer/lmi/"],
+    "scipy": ["designer/lmi/", "designer/gain.py"],
     "flint": [
         "designer/balls.py",
         "designer/ball_model.py",
