@@ -26,15 +26,12 @@ class Point(NamedTuple):
     inverse_hessian: Array
 
 
-def start(function: Function, x: Array, inverse_hessian: Array | None = None) -> Point:
-    """The first point; without an inverse Hessian, steps of length 1 downhill are tried first."""
-    value, gradient = function(x)
-    if inverse_hessian is None:
-        inverse_hessian = np.eye(len(x)) / max(float(np.linalg.norm(gradient)), 1e-300)
-    return Point(x, value, gradient, inverse_hessian)
+def start(function: Function, x: Array, inverse_hessian: Array) -> Point:
+    """The first point."""
+    return Point(x, *function(x), inverse_hessian)
 
 
-def step(function: Function, point: Point, *, scale: bool = False) -> Point | None:
+def step(function: Function, point: Point) -> Point | None:
     """One step downhill and the update of the inverse Hessian; None where no step goes down any more."""
     H, gradient = point.inverse_hessian, point.gradient
     direction = -(H @ gradient)
@@ -48,8 +45,6 @@ def step(function: Function, point: Point, *, scale: bool = False) -> Point | No
     s, y = t * direction, gradient_next - gradient
     sy = float(s @ y)
     if sy > 0.0:
-        if scale:  # the first time: the size of the Hessian is known only now
-            H = np.eye(len(s)) * (sy / float(y @ y))
         Hy = H @ y
         u = s / sy
         H = H - np.outer(u, Hy) - np.outer(Hy, u) + (1.0 + float(y @ Hy) / sy) * np.outer(u, s)

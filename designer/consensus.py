@@ -93,7 +93,7 @@ def _plant_covariance(problem: Problem) -> Array:
 def least_variance_gains(problem: Problem) -> StackedGains:
     """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
     modes, nx, columns = len(problem.topologies), problem.nx, measurement_slices(problem)
-    regressions = {(s, i): _regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
+    regressions = {(s, i): node_regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
     occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
@@ -125,7 +125,7 @@ def least_variance_gains(problem: Problem) -> StackedGains:
     return K_bar, H_bar
 
 
-class _Regression(NamedTuple):
+class Regression(NamedTuple):
     """e_i(k+1) = t - sum_j K_ij a_j - sum_j H_ij phi_ij nu_j of one node and mode, over [eta; w].
 
     The regressors are all a_j and phi_ij nu_j. Where gains are unbiased t = A e_i + B w and
@@ -147,7 +147,8 @@ class _Regression(NamedTuple):
         return np.asarray((self.t @ joint @ self.mean.T * scale) @ inverse * scale)
 
 
-def _regression(problem: Problem, s: int, i: int) -> _Regression:
+def node_regression(problem: Problem, s: int, i: int) -> Regression:
+    """What node i regresses its next error on, in mode s."""
     nx, plant, p = problem.nx, problem.plant, problem.plant_states
     heard, at_w, eye = problem.neighbours(s, i), p + problem.n * problem.nx, np.eye(problem.nx)
     others = [j for j in heard if not problem.unbiased or j != i]
@@ -177,4 +178,4 @@ def _regression(problem: Problem, s: int, i: int) -> _Regression:
         mean += rho * sent
         noises += [np.sqrt(rho * (1.0 - rho)) * sent] if rho < 1.0 else []
         noises += [np.sqrt(rho * beta * (1.0 - beta)) * lost] if beta < 1.0 else []
-    return _Regression(t, mean, noises, K, H)
+    return Regression(t, mean, noises, K, H)

@@ -22,13 +22,14 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer import bfgs
-from designer.barrier import Barrier
+from designer.barrier import Barrier, Entries
 from designer.error_model import StackedGains, error_model
 from designer.gain import Gain, exact_gain, horizon_gain
 
 _COARSE = (3e-2, 9e-3, 3e-3, 9e-4)  # mu: enough to see which start leads lowest
 _FINE = (3e-4, 9e-5, 3e-5, 9e-6)
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
+_RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
 _HORIZON = 30
 _LONGEST = 480
 _SHORT = 1e-4  # gamma may exceed gamma_T by so much of itself before T is doubled
@@ -49,7 +50,7 @@ class Progress(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Gains, what they guarantee, and their size: the Euclidean norm of all entries."""
+    """Gains, what they guarantee, and their size: the Euclidean norm of all free entries, in natural units."""
 
     K_bar: Array
     H_bar: Array
@@ -101,7 +102,7 @@ def descend(
 
 
 def _candidate(problem: Problem, K_bar: Array, H_bar: Array) -> Candidate:
-    norm = math.hypot(float(np.linalg.norm(K_bar)), float(np.linalg.norm(H_bar)))
+    norm = float(np.linalg.norm(Entries(problem).pack(K_bar, H_bar)))
     return Candidate(K_bar, H_bar, exact_gain(error_model(problem, K_bar, H_bar)), norm)
 
 
@@ -131,7 +132,7 @@ class _Search:
             self.found[name] = math.exp(coarse[name].x[-1] / 2.0)
         name = min(self.found, key=lambda start: self.found[start])
         point = self._lengthen(name, _COARSE[-1:], coarse[name])
-        point = self._follow(name, _FINE, point.x, point.inverse_hessian)
+        point = self._follow(name, _FINE, point.x)
         point = self._lengthen(name, _FINE, point)
         if self._gain(point.x).stable:
             self._centre(point)
@@ -166,9 +167,7 @@ class _Search:
             )
         return np.append(v, math.log(1.1 * g))
 
-    def _follow(
-        self, name: str, weights: tuple[float, ...], x: Array, inverse_hessian: Array | None = None
-    ) -> bfgs.Point:
+    def _follow(self, name: str, weights: tuple[float, ...], x: Array) -> bfgs.Point:
         """The minima of J for falling mu, each only as exactly as the next one needs."""
 
         def advance(x: Array) -> None:
@@ -178,26 +177,28 @@ class _Search:
                 gamma, seconds = math.exp(x[-1] / 2.0), time.perf_counter() - self.begun
                 self.progress(Progress(name, mu, self.steps, gamma, seconds))
 
-        for mu in weights:
+        for mu in weights:  # BFGS begins anew each time: what it knows of where J was is worth less than that of here
+            inverse_hessian = self.barrier.inverse_hessian(x, mu)
             point = self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
-            x, inverse_hessian = point.x, point.inverse_hessian
+            x = point.x
         return point
 
     def _centre(self, point: bfgs.Point) -> None:
         """From the least gamma to smaller and faster gains, gamma held below _SLACK times the least."""
         v, y = point.x[:-1], float(point.x[-1]) + 2.0 * math.log(_SLACK)
-        function = self.barrier.centre(y, scale=float(np.linalg.norm(v)))
+        ridge = _RIDGE / float(v @ v)
 
         def advance(v: Array) -> None:
             self.centred = v
 
-        self._minimise(function, v, None, advance, enough=1e-2)
+        inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)[:-1, :-1]
+        self._minimise(self.barrier.centre(y, ridge), v, inverse_hessian, advance, enough=1e-2)
 
     def _minimise(
         self,
         function: bfgs.Function,
         x: Array,
-        inverse_hessian: Array | None,
+        inverse_hessian: Array,
         advance: Callable[[Array], None],
         *,
         enough: float,
@@ -206,7 +207,7 @@ class _Search:
         point = bfgs.start(function, x, inverse_hessian)
         values = [point.value]
         while len(values) < _MOST_STEPS:
-            following = bfgs.step(function, point, scale=inverse_hessian is None and len(values) == 1)
+            following = bfgs.step(function, point)
             if following is None:
                 break
             point = following

@@ -48,6 +48,7 @@ class Slope(NamedTuple):
     K_bar: Array  # (modes, n nx, n nx)
     H_bar: Array  # (modes, n nx, sum ny)
     g: float  # minus the energy of the w that follow what was put in
+    moments: Array  # (T, modes, n_eta + nw, n_eta + nw): of [eta; w], as V started them
 
 
 class Inputs:
@@ -113,7 +114,7 @@ def slope(model: ErrorModel, operator: Operator, inputs: Inputs, swept: Sweep, V
         roots = np.sqrt(model.alpha[model.owner[operator.lossy]])
         by_H[:, :, operator.lossy] = 2.0 * (swept.Y_bar[:, :, p:, p:] @ (operator.H @ lost)).sum(axis=0) * roots
     by_V = None if links is None else links.by_V(swept.Y_bar, joint)
-    return Slope(*inputs.gains(model, by_AB, by_H, by_V), -spent)
+    return Slope(*inputs.gains(model, by_AB, by_H, by_V), -spent, joint)
 
 
 class GainSlope(NamedTuple):

@@ -22,10 +22,10 @@ from designer.error_model import error_model, link_gains
 from designer.inwards import inwards
 from designer.lmi import cliques, conic, decomposed, theorem2
 from designer.lmi.cones import Assembly
-from designer.lmi.units import natural_units
 from designer.lmi.witness import Witness, witness
 from designer.problems import find
 from designer.synthesis import block_diagonal, design, recover
+from designer.units import natural_units
 
 PAPER = [
     find("zhu2020-ideal"),

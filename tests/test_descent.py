@@ -23,6 +23,7 @@ from designer.floor import floor
 from designer.gain import Operator, exact_gain
 from designer.problems import find
 from designer.synthesis import design
+from designer.units import Units, rescaled
 
 PROBLEMS = [random_problem(1), random_problem(2), *real_networks(3).values()]
 
@@ -62,7 +63,7 @@ def test_entries_are_those_that_the_topologies_allow() -> None:
     v = entries.pack(K_bar, H_bar)
     assert np.count_nonzero(v) == np.count_nonzero(K_bar) + np.count_nonzero(H_bar)
     for stacked, back in zip((K_bar, H_bar), entries.unpack(v), strict=True):
-        np.testing.assert_array_equal(stacked, back)
+        np.testing.assert_allclose(stacked, back, rtol=1e-15)
 
 
 def test_consensus_gains_leave_the_estimates_unbiased() -> None:
@@ -119,13 +120,97 @@ def test_bfgs_finds_a_minimum_with_a_kink() -> None:
         gradient = np.array([(x[0] - 1.0) / 2.0 - 4.0 * x[0] * np.sign(inner), np.sign(inner)])
         return float((x[0] - 1.0) ** 2 / 4.0 + abs(inner)), gradient
 
-    point = bfgs.start(kinked, np.array([-1.0, 1.3]))
+    point = bfgs.start(kinked, np.array([-1.0, 1.3]), np.eye(2))
     for _ in range(300):
         following = bfgs.step(kinked, point)
         if following is None:
             break
         point = following
     assert point.value < 1e-5
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
+def test_bfgs_begins_with_the_curvature_of_what_each_node_chooses(problem: Problem) -> None:
+    """With Y_bar and the moments held, -log det is a quadratic of one node's gains; second differences of it are exact.
+
+    It is written out with S(Y_bar), which shares nothing with the regressions of `inverse_hessian`.
+    """
+    barrier, mu, rng = Barrier(problem, 9), 0.03, np.random.default_rng(0)
+    gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
+    v = barrier.entries.pack(*gains)
+    x = np.append(v, math.log(2.0 * exact_gain(error_model(problem, *gains)).high ** 2))
+    found = barrier._swept(x)
+    assert found is not None
+    swept, slopes = found
+
+    def held(v: Array) -> float:
+        operator = barrier.operator(v)
+        pairs = zip(swept.Y_bar, slopes.moments, strict=True)
+        return mu * sum(float((operator.joint(Y_bar) * moments).sum()) for Y_bar, moments in pairs)
+
+    inverse = barrier.inverse_hessian(x, mu, ridge=0.7)
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            at = barrier.entries.of_node(s, i)
+            damped = np.linalg.inv(inverse[np.ix_(at, at)])
+            hessian = damped - np.diag(damped.diagonal() * 0.1 / 1.1)
+            direction = np.zeros(len(v))
+            direction[at] = rng.normal(size=len(at))
+            second = held(v + direction) - 2.0 * held(v) + held(v - direction) + 0.7 * float(direction @ direction)
+            assert float(direction[at] @ hessian @ direction[at]) == pytest.approx(second, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", sorted(real_networks(4)))
+def test_the_entries_of_a_node_are_its_rows_and_all_are_somebodys(kind: str) -> None:
+    problem = real_networks(4)[kind]
+    entries, nx, seen = Entries(problem), problem.nx, []
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            at = entries.of_node(s, i)
+            seen += at.tolist()
+            v = np.zeros(len(entries.units))
+            v[at] = 1.0
+            for moved, still in zip(entries.unpack(v), entries.unpack(0.0 * v), strict=True):
+                where, rows, _ = np.nonzero(moved != still)
+                assert set(where) <= {s}  # no K at all where a node hears itself alone
+                assert set(rows // nx) <= {i}
+    assert sorted(seen) == list(range(len(entries.units)))
+
+
+def in_other_units(problem: Problem, x: Array, y: Array) -> Problem:
+    """The same network with x = diag(x) x' and y = diag(y) y', y of all nodes."""
+    document, first = rescaled(problem, Units(x, 1.0)).document(), 0
+    for node in document["node"]:
+        rows = slice(first, first + len(node["C"]))
+        node["C"], node["D"] = (np.asarray(node[name]) / y[rows, None] for name in "CD")
+        node["C"], node["D"], first = node["C"].tolist(), node["D"].tolist(), rows.stop
+    return Problem.from_document(document)
+
+
+@pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
+def test_the_search_does_not_depend_on_units(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Powers of 2 change no rounding: the same steps, and the same gamma from every start, bit for bit."""
+    monkeypatch.setattr(descent, "_COARSE", (3e-2, 9e-3))
+    monkeypatch.setattr(descent, "_FINE", (3e-3,))
+    problem = real_networks(6, n=2)[kind]
+    starts = {"consensus": consensus_gains(problem, weight=0.4), "least variance": least_variance_gains(problem)}
+    x, y = 2.0 ** np.array([-3, 5]), 2.0 ** np.array([4, -6, 2])
+    each = np.tile(x, problem.n)
+    others = {name: (K * each / each[:, None], H * y / each[:, None]) for name, (K, H) in starts.items()}
+    found, other = descend(problem, starts), descend(in_other_units(problem, x, y), others)
+    assert other.steps == found.steps
+    assert other.starts == found.starts
+    assert other.least.gain.high == pytest.approx(found.least.gain.high, rel=1e-6)
+    assert other.least.norm == found.least.norm
+    np.testing.assert_array_equal(other.least.K_bar * each[:, None] / each, found.least.K_bar)
+
+
+def test_starts_agree_on_the_pendulum_whose_states_are_of_different_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(descent, "_FINE", (3e-4,))
+    problem = find("inverted-pendulum")
+    starts = {"consensus": consensus_gains(problem), "least variance": least_variance_gains(problem)}
+    found = descend(problem, starts)
+    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
 
 
 def test_any_start_leads_to_the_answer_that_is_known() -> None:

@@ -15,9 +15,9 @@ from agent.contract.problem import Problem
 from designer.back_off import inequality_17, plant_lyapunov
 from designer.error_model import error_model, paper_error_model, stacks
 from designer.lmi import theorem2
-from designer.lmi.units import natural_units, rescaled
 from designer.problems import find
 from designer.synthesis import block_diagonal, recover
+from designer.units import natural_units, rescaled
 
 
 def analysis_optimum(problem: Problem) -> float:

@@ -38,7 +38,7 @@ from designer.lmi import LmiSolution, attempts, conic
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.cliques import clique_tree
 from designer.lmi.cones import Assembly, Cones, Indices, Inequality
-from designer.lmi.units import Units, natural_units, rescaled
+from designer.units import Units, natural_units, rescaled
 
 Link = tuple[int, int]  # (i, j): node i hears node j
 MARGIN = 1e-6  # of the balance, for unstable plants: designer.inwards knows no way inwards there

@@ -27,7 +27,7 @@ from designer.error_model import Stacks, stacks
 from designer.lmi import LmiSolution, attempts, beyond_paper
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.conic import failure
-from designer.lmi.units import Units, natural_units, rescaled
+from designer.units import Units, natural_units, rescaled
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     cp.CLARABEL: {"chordal_decomposition_merge_method": "none"},  # three times faster than merging on six nodes

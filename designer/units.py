@@ -1,4 +1,4 @@
-"""Units in which the numbers of a problem and of its LMI are near 1, for the solvers."""
+"""Units in which the numbers of a problem and of its LMI are near 1, for the search and for the solvers."""
 
 from __future__ import annotations
 
