@@ -1,6 +1,6 @@
 """The mathematics of peakmesh, seen centrally: design, verification, replay, pictures.
 
-the model       error_model
+the model       error_model; units: natural ones
 any gains       gain: their exact gain; sensitivity: its derivative; worst_case: the disturbances that attain it;
                 floor: below which no gains get; analysis: all of that for somebody else's gains; ladder: its lines
 the search      descent, along the barrier, by bfgs, from consensus gains; exact_design: from problem to gains that way

@@ -177,7 +177,7 @@ class _Search:
                 gamma, seconds = math.exp(x[-1] / 2.0), time.perf_counter() - self.begun
                 self.progress(Progress(name, mu, self.steps, gamma, seconds))
 
-        for mu in weights:  # BFGS begins anew each time: what it knows of where J was is worth less than that of here
+        for mu in weights:  # BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
             inverse_hessian = self.barrier.inverse_hessian(x, mu)
             point = self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
             x = point.x

@@ -1,10 +1,10 @@
 """How long the search for the least exact gain takes, estimated before it begins: what the default method depends on.
 
 The time grows with the free entries of the gains (how many steps the search takes), with the modes and with the size of
-the error state (what a step costs). The factors are a fit to the processor time of one core: 10 and 17 s for the
-paper's examples (210 free entries, 4 modes, 10 states), 27 s for quadruple-tank (1040, 3, 28), 150 s for 20 nodes
-(1362, 4, 42), and for 30 nodes (2130, 4, 62) more than 900 s. Within a factor of 4 of these; beyond an extrapolation.
-Lossy links make a step dearer, and an unstable plant the search longer: inverted-pendulum takes 18 s in place of 2.
+the error state (what a step costs). The factors were fitted to an earlier search, which took more steps, and were not
+fitted anew. The paper's examples (210 free entries, 4 modes, 10 states) take 12 and 8 s of processor time and are
+estimated at 9; quadruple-tank (1040, 3, 28) takes 19 s in place of 115. Lossy links make a step dearer, and an unstable
+plant the search longer: inverted-pendulum takes 9 s in place of 2.
 """
 
 from __future__ import annotations
