@@ -148,7 +148,7 @@ def critical_sweep(operator: Operator, horizon: int) -> tuple[float, Sweep]:
 
     Later steps raise gamma_T by less than can be told: their W turns singular within rounding of the same g.
     """
-    low, _ = horizon_gain(operator, horizon)
+    low, _ = horizon_gain(operator, horizon, width=1e-10)
     first, last = 0, horizon
     while last - first > 1:
         middle = (first + last) // 2
