@@ -62,7 +62,10 @@ class Ladder(NamedTuple):
         there = [(value, name) for value, name in rungs if value is not None]
         texts = [(f"{value:.6f}" if name == "floor" else rounded_up(value), name) for value, name in there]
         width = max((len(value) for value, _ in texts), default=0)
-        return [f"{value:{width}}  {name}" for value, name in texts]
+        lines = [f"{value:{width}}  {name}" for value, name in texts]
+        if self.exact is None and self.gamma is not None:
+            lines.append(f"{'-':{width}}  exact gain of these gains: not computed for so large a network; analyse does")
+        return lines
 
 
 def ladder_of(gains: Gains) -> Ladder:
