@@ -2,9 +2,9 @@
 
 The time grows with the free entries of the gains (how many steps the search takes), with the modes and with the size of
 the error state (what a step costs). The estimate is rough. In seconds of processor time, measured and estimated: the
-paper's examples (210 free entries, 4 modes, 10 states) 9 and 8, both estimated 9; quadruple-tank (1040, 3, 28) 19 and 115;
-20 nodes (1362, 4, 42) 107 and 350; 30 nodes (2130, 4, 62) 840 and 898, which is where it matters. Lossy links make a
-step dearer, and an unstable plant the search longer: inverted-pendulum takes 9 s in place of 2.
+paper's examples (210 free entries, 4 modes, 10 states) 9 and 8, both estimated 9; quadruple-tank (1040, 3, 28) 19 and
+115; 20 nodes (1362, 4, 42) 107 and 350; 30 nodes (2130, 4, 62) 840 and 898, which is where it matters. Lossy links make
+a step dearer, and an unstable plant the search longer: inverted-pendulum takes 9 s in place of 2.
 """
 
 from __future__ import annotations
