@@ -97,6 +97,19 @@ class Mode(NamedTuple):
     peaks: list[Inequality]
 
 
+class Receiver(NamedTuple):
+    """Node i in one mode, and what its inequalities are written with and into."""
+
+    build: Assembly
+    problem: Problem
+    columns: Columns
+    mode: Mode
+    i: int
+    Q_bar: list[tuple[float, Indices]]  # sum of weight times Q_t
+    piece: Piece  # of the balance, where node i is at home
+    onto: float  # what x and w do to an error is multiplied by it: 1 / (the unit of errors)
+
+
 class Lmi(NamedTuple):
     """The whole problem: minimise delta, over all modes."""
 
@@ -160,14 +173,13 @@ def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lm
         mode = Mode(Q[s], X, Y, T={}, U={}, balance=balance, nodes=[], losses={}, links={}, peaks=[])
         for i in range(n):
             Q_bar = [(float(weight), Q[t][i]) for t, weight in enumerate(weights) if weight > 0.0]
-            piece = balance[home[i]]
-            part = _node(build, problem, columns, mode, i, heard[i], Q_bar, piece, spared[home[i]] == i, 1.0 / error)
-            mode.nodes.append(part)
+            at = Receiver(build, problem, columns, mode, i, Q_bar, balance[home[i]], onto=1.0 / error)
+            mode.nodes.append(_node(at, heard[i], spared=spared[home[i]] == i))
             for j in heard[i]:
                 if problem.beta[j] < 1.0:
-                    _loss(build, problem, columns, mode, (i, j), Q_bar, piece, 1.0 / error)
+                    _loss(at, j)
                 if problem.delivery[i, j] < 1.0:
-                    _link(build, problem, columns, mode, (i, j), Q_bar, piece, 1.0 / error)
+                    _link(at, j)
             mode.peaks.append(_peak(build, problem, Q[s][i], delta))
         modes.append(mode)
     return Lmi(columns, delta, R, modes, build.cones())
@@ -224,22 +236,9 @@ def _home(balance: list[Piece], heard: tuple[int, ...]) -> int:
     return min(fitting, key=lambda k: len(balance[k].at))
 
 
-def _node(
-    build: Assembly,
-    problem: Problem,
-    columns: Columns,
-    mode: Mode,
-    i: int,
-    heard: tuple[int, ...],
-    Q_bar: list[tuple[float, Indices]],
-    piece: Piece,
-    spared: bool,
-    onto: float,
-) -> NodePart:
-    """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there.
-
-    Here and below, what x and w do to an error is multiplied by `onto`.
-    """
+def _node(at: Receiver, heard: tuple[int, ...], *, spared: bool) -> NodePart:
+    """[S_i, G_i'; G_i, Q_bar_i] >= 0; where the node is spared its S_i, the piece of the balance stands there."""
+    build, problem, columns, mode, i, Q_bar, piece, onto = at
     nx, plant, rho, shared = problem.nx, problem.plant, problem.delivery, len(columns.shared)
     if problem.unbiased:
         piece = Piece(piece.matrix, {**piece.at, 0: piece.at[0][len(piece.at[0]) - shared :]})  # x is not in G_i
@@ -278,19 +277,10 @@ def _node(
     return NodePart(matrix, part.rows(vertices), last, S)
 
 
-def _loss(
-    build: Assembly,
-    problem: Problem,
-    columns: Columns,
-    mode: Mode,
-    link: Link,
-    Q_bar: list[tuple[float, Indices]],
-    piece: Piece,
-    onto: float,
-) -> None:
+def _loss(at: Receiver, j: int) -> None:
     """[T_ij, X_ij'; X_ij, Q_bar_i] >= 0, and -alpha_j rho_ij r_j'T_ij r_j in the balance."""
-    j, matrix = link[1], build.inequality()
-    node = problem.nodes[j]
+    build, problem, columns, mode, i, Q_bar, piece, onto = at
+    matrix, node, link = build.inequality(), problem.nodes[j], (i, j)
     beta, C = node.arrival_probability, node.C
     T = build.symmetric(len(C))
     y, last = matrix.append(len(C)), matrix.append(problem.nx)
@@ -307,18 +297,10 @@ def _loss(
     mode.T[link], mode.losses[link] = T, matrix
 
 
-def _link(
-    build: Assembly,
-    problem: Problem,
-    columns: Columns,
-    mode: Mode,
-    link: Link,
-    Q_bar: list[tuple[float, Indices]],
-    piece: Piece,
-    onto: float,
-) -> None:
+def _link(at: Receiver, j: int) -> None:
     """[U_ij, V_ij'; V_ij, Q_bar_i] >= 0, and -rho_ij (1 - rho_ij) U_ij in the balance."""
-    (i, j), matrix, nx, nw = link, build.inequality(), problem.nx, len(columns.of(link[1]))
+    build, problem, columns, mode, i, Q_bar, piece, onto = at
+    matrix, link, nx, nw = build.inequality(), (i, j), problem.nx, len(columns.of(j))
     node, rho, X, Y = problem.nodes[j], float(problem.delivery[link]), mode.X[link].T, mode.Y[link].T
     U = build.symmetric(2 * nx + nw)
     e_i, e_j, w, last = (matrix.append(size) for size in (nx, nx, nw, nx))
