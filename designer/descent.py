@@ -116,12 +116,15 @@ class _Search:
         self.found: dict[str, float] = {}
         self.best: Array | None = None  # [v; y] with the least y so far
         self.ends: list[Array] = []  # v of what each start led to
-        self.centred: Array | None = None  # v of the gains that are small and decay fast
+        self.centred: list[Array] = []  # v of ever smaller gains
 
     def in_hand(self) -> list[StackedGains]:
-        """What each start led to, the best gains so far, and the centred ones."""
-        best = None if self.best is None else self.best[:-1]
-        return [self.barrier.entries.unpack(v) for v in (*self.ends, best, self.centred) if v is not None]
+        """What each start led to, the best gains so far, and the last of the centred ones and every tenth before it.
+
+        The last alone would not do: what grows too slowly to be seen within T steps, centring lets grow.
+        """
+        best = [] if self.best is None else [self.best[:-1]]
+        return [self.barrier.entries.unpack(v) for v in (*self.ends, *best, *self.centred[::-10])]
 
     def run(self, starts: Mapping[str, StackedGains]) -> None:
         """Every start by the coarse weights, the best by the fine ones, on longer horizons while T is too short."""
@@ -187,12 +190,8 @@ class _Search:
         """From the least gamma to smaller and faster gains, gamma held below _SLACK times the least."""
         v, y = point.x[:-1], float(point.x[-1]) + 2.0 * math.log(_SLACK)
         ridge = _RIDGE / float(v @ v)
-
-        def advance(v: Array) -> None:
-            self.centred = v
-
         inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)[:-1, :-1]
-        self._minimise(self.barrier.centre(y, ridge), v, inverse_hessian, advance, enough=1e-2)
+        self._minimise(self.barrier.centre(y, ridge), v, inverse_hessian, self.centred.append, enough=1e-2)
 
     def _minimise(
         self,

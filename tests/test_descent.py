@@ -213,6 +213,14 @@ def test_starts_agree_on_the_pendulum_whose_states_are_of_different_size(monkeyp
     assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
 
 
+def test_gains_are_chosen_on_the_way_where_the_smallest_are_not_stable() -> None:
+    """In the paper's first example centring ends at errors that grow, too slowly for the horizon."""
+    problem = find("zhu2020-ideal")
+    found = descend(problem, {"least variance": least_variance_gains(problem)})
+    assert found.chosen.gain.high <= 1.00101 * found.least.gain.high
+    assert found.chosen.cost < 0.5 * found.least.cost
+
+
 def test_any_start_leads_to_the_answer_that_is_known() -> None:
     """two-nodes has the gain sqrt 2 at best; the chosen gains are within 0.1 % of the least found."""
     problem = find("two-nodes")
