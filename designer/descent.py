@@ -94,16 +94,17 @@ def descend(
         search.run(starts)
     except KeyboardInterrupt:
         interrupted = True
-    found = [_candidate(problem, *gains) for gains in (*starts.values(), *search.in_hand())]
+    entries = search.barrier.entries
+    found = [_candidate(entries, *gains) for gains in (*starts.values(), *search.in_hand())]
     least = min(found, key=lambda candidate: candidate.rank)
     near = [candidate for candidate in found if candidate.gain.high <= _SLACK * (1.0 + 1e-6) * least.gain.high]
     chosen = min(near, key=lambda candidate: candidate.cost) if least.gain.stable else least
     return Descent(chosen, least, search.found, search.steps, interrupted)
 
 
-def _candidate(problem: Problem, K_bar: Array, H_bar: Array) -> Candidate:
-    norm = float(np.linalg.norm(Entries(problem).pack(K_bar, H_bar)))
-    return Candidate(K_bar, H_bar, exact_gain(error_model(problem, K_bar, H_bar)), norm)
+def _candidate(entries: Entries, K_bar: Array, H_bar: Array) -> Candidate:
+    norm = float(np.linalg.norm(entries.pack(K_bar, H_bar)))
+    return Candidate(K_bar, H_bar, exact_gain(error_model(entries.problem, K_bar, H_bar)), norm)
 
 
 class _Search:
