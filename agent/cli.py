@@ -29,8 +29,8 @@ from agent.contract.errors import (
 from agent.plan import LARGEST_WINDOW
 
 if TYPE_CHECKING:
-    from agent.bus import Network
     from agent.contract.gains import Gains
+    from agent.network.bus import Network
     from agent.plan import Plan
 
 Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # what add_subparsers returns
@@ -161,8 +161,8 @@ def plant_command(options: argparse.Namespace) -> int:
 
 def coordinator_command(options: argparse.Namespace) -> int:
     """`peakmesh coordinator GAINS`."""
-    from agent.bus import Bus
     from agent.contract.messages import COORDINATOR
+    from agent.network.bus import Bus
     from agent.roles import coordinator
 
     gains = load_gains(options.gains)
@@ -177,8 +177,8 @@ def coordinator_command(options: argparse.Namespace) -> int:
 
 def recorder_command(options: argparse.Namespace) -> int:
     """`peakmesh recorder GAINS -o FILE`."""
-    from agent.bus import Bus
     from agent.contract.messages import RECORDER
+    from agent.network.bus import Bus
     from agent.roles import recorder
 
     gains = load_gains(options.gains)
@@ -191,8 +191,8 @@ def recorder_command(options: argparse.Namespace) -> int:
 
 
 def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
-    from agent.bus import Bus
     from agent.contract.messages import in_words
+    from agent.network.bus import Bus
 
     run = options.run or gains.problem.name
     with Bus(_network(options), run=run, who=who) as bus:
@@ -321,7 +321,7 @@ def _plan(options: argparse.Namespace, gains: Gains) -> Plan:
 
 
 def _network(options: argparse.Namespace) -> Network:
-    from agent.bus import Network
+    from agent.network.bus import Network
 
     connect = tuple(options.connect)
     if options.child:

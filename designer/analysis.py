@@ -21,12 +21,12 @@ from agent.contract.files import read_bytes
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
 from designer.diagnosis import refuse_nothing_to_estimate
-from designer.error_model import error_model, stacked_links
-from designer.exact_design import certify
-from designer.floor import floor
-from designer.gain import exact_gain
+from designer.gain.exact import exact_gain
+from designer.gain.floor import floor
+from designer.gain.worst_case import with_worst_case, worst_disturbance, worst_policy
 from designer.ladder import Ladder
-from designer.worst_case import with_worst_case, worst_disturbance, worst_policy
+from designer.model.error_model import error_model, stacked_links
+from designer.search.exact_design import certify
 
 _MOST_COLUMNS = 200  # of w over all steps, in the search for the worst w that is fixed beforehand
 

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.consensus import consensus_gains, least_variance_gains
-from designer.error_model import StackedGains
-from designer.exact_design import exact_bounds
-from designer.floor import floor
+from designer.gain.floor import floor
 from designer.ladder import rounded_up
+from designer.model.error_model import StackedGains
 from designer.problems import find
+from designer.search.exact_design import exact_bounds
+from designer.search.starts import consensus_gains, least_variance_gains
 
 PRINTED = {"zhu2020-ideal": 0.23, "zhu2020-lossy": 0.36}  # gamma of examples 1 and 2
 EXAMPLES = tuple(PRINTED)

@@ -12,8 +12,8 @@ node, e_i = x - x_hat_i, as it follows from eqs. (1)-(5) with the losses and del
 e is not computed as x - x_hat: an unstable plant would leave nothing of it but the rounding of x. Where the gains are
 unbiased, the first bracket is 0; where also every loss is seen, x is not needed and stays 0.
 
-This shares no arithmetic with the error model of designer/error_model.py, nor with agent/filter.py. docs/theory.md,
-section 8, says what the ensemble can show and what not.
+This shares no arithmetic with the error model of designer/model/error_model.py, nor with agent/filter.py.
+docs/theory.md, section 8, says what the ensemble can show and what not.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.problem import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
-from designer.error_model import measurement_slices, stacked_gains
+from designer.model.error_model import measurement_slices, stacked_gains
 from designer.workers import each
 
 CONFIDENCE = 0.99  # that the intervals of all steps hold at once

@@ -13,17 +13,17 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.back_off import Confirmed, back_off, least_gamma, satisfies_17
-from designer.certificate import check
-from designer.descent import Progress
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
-from designer.effort import default_method
-from designer.error_model import error_model, link_gains, stacked_links
-from designer.exact_design import design_exact, with_ladder
-from designer.inwards import inwards
+from designer.gain.worst_case import with_worst_case
 from designer.lmi import LmiSolution
 from designer.lmi.attempts import tried_further
-from designer.worst_case import with_worst_case
+from designer.lmi.back_off import Confirmed, back_off, least_gamma, satisfies_17
+from designer.lmi.inwards import inwards
+from designer.model.error_model import error_model, link_gains, stacked_links
+from designer.proof.theorem1 import check
+from designer.search.descent import Progress
+from designer.search.effort import default_method
+from designer.search.exact_design import design_exact, with_ladder
 
 
 class Designed(NamedTuple):

@@ -17,12 +17,12 @@ import numpy as np
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.back_off import least_gamma
-from designer.certificate import lyapunov_matrix
-from designer.effort import default_method
-from designer.error_model import StackedGains, error_model, stacked_gains, stacked_links
-from designer.gain import exact_gain
+from designer.gain.exact import exact_gain
 from designer.ladder import percent, rounded_up
+from designer.lmi.back_off import least_gamma
+from designer.model.error_model import StackedGains, error_model, stacked_gains, stacked_links
+from designer.proof.theorem1 import lyapunov_matrix
+from designer.search.effort import default_method
 from designer.workers import each, greet_cluster
 
 
@@ -191,7 +191,7 @@ def _priced(job: _Job) -> Priced:
 
 
 def _design(problem: Problem, method: str, start: StackedGains | None = None) -> Gains:
-    from designer.exact_design import design_exact
+    from designer.search.exact_design import design_exact
     from designer.synthesis import design
 
     if method == "exact" and start is not None:

@@ -7,11 +7,9 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).parent.parent
+from places import ROOT
 
 # What is imported -> the files and folders that may. The longest name that fits decides; what is not here is free.
 WHO_MAY_IMPORT = {
@@ -23,19 +21,19 @@ WHO_MAY_IMPORT = {
     # replay shares no step arithmetic with the nodes
     "agent.filter": ["agent/inbox.py", "agent/roles/node.py"],
     # each outside thing behind one door
-    "zenoh": ["agent/bus.py"],
+    "zenoh": ["agent/network/bus.py"],
     "mcap": ["agent/contract/recording.py"],
     "zstandard": ["agent/contract/recording.py"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": ["designer/lmi/", "designer/gain.py"],
+    "scipy": ["designer/lmi/", "designer/gain/exact.py"],
     "flint": [
-        "designer/balls.py",
-        "designer/ball_model.py",
-        "designer/certificate.py",
-        "designer/exact_certificate.py",
+        "designer/proof/balls.py",
+        "designer/proof/ball_model.py",
+        "designer/proof/theorem1.py",
+        "designer/proof/recursion.py",
     ],
-    "matplotlib": ["designer/figures.py"],
+    "matplotlib": ["designer/report/figures.py"],
     "rich": ["agent/cli.py", "designer/commands/"],
     "distributed": ["designer/workers.py"],
 }
@@ -44,8 +42,19 @@ WHO_MAY_IMPORT = {
 LEAVES = "agent/contract/"
 
 # These know no clock, no chance, no network, no other thread.
-PURE = ["agent/filter.py", "agent/inbox.py", "agent/ledger.py"]
-IMPURE = ["time", "datetime", "random", "secrets", "socket", "threading", "asyncio", "os", "subprocess", "agent.bus"]
+PURE = ["agent/filter.py", "agent/inbox.py", "agent/receipts.py"]
+IMPURE = [
+    "time",
+    "datetime",
+    "random",
+    "secrets",
+    "socket",
+    "threading",
+    "asyncio",
+    "os",
+    "subprocess",
+    "agent.network.bus",
+]
 
 # Command lines answer at once: before a command is called they import the standard library and these alone.
 LAZY = ["agent/cli.py", "designer/cli.py", "designer/commands/", "agent/__main__.py", "designer/__main__.py"]
@@ -122,7 +131,7 @@ def test_every_place_of_the_table_exists_and_the_walk_finds_it() -> None:
 @pytest.mark.parametrize(
     ("path", "line", "found"),
     [
-        ("agent/roles/node.py", "import designer.error_model", "designer.error_model"),
+        ("agent/roles/node.py", "import designer.model.error_model", "designer.model.error_model"),
         ("agent/launch.py", "from designer import synthesis", "designer.synthesis"),
         ("agent/roles/plant.py", "import zenoh", "zenoh"),
         ("agent/roles/plant.py", "def f():\n    import zenoh", "zenoh"),
@@ -133,19 +142,19 @@ def test_every_place_of_the_table_exists_and_the_walk_finds_it() -> None:
         ("agent/contract/gains.py", "from ..filter import Pair", "..filter.Pair"),
         ("agent/filter.py", "import random", "random"),
         ("agent/inbox.py", "from time import monotonic", "time.monotonic"),
-        ("agent/ledger.py", "import threading", "threading"),
-        ("designer/certificate.py", "import cvxpy as cp", "cvxpy"),
+        ("agent/receipts.py", "import threading", "threading"),
+        ("designer/proof/theorem1.py", "import cvxpy as cp", "cvxpy"),
         ("designer/synthesis.py", "try:\n    import clarabel\nexcept ImportError:\n    pass", "clarabel"),
         ("designer/replay/proofs.py", "from agent.filter import step", "agent.filter.step"),
         ("designer/replay/__init__.py", "from agent import filter", "agent.filter"),
         ("designer/replay/__init__.py", "import agent.inbox", "agent.inbox"),
         ("designer/show.py", "import agent.cli", "agent.cli"),
-        ("designer/certificate.py", "import matplotlib.pyplot", "matplotlib.pyplot"),
+        ("designer/proof/theorem1.py", "import matplotlib.pyplot", "matplotlib.pyplot"),
         ("agent/cli.py", "import numpy", "numpy at once"),
         ("agent/cli.py", "from agent.contract.gains import Gains", "agent.contract.gains.Gains at once"),
         ("designer/cli.py", "if True:\n    import designer.synthesis", "designer.synthesis at once"),
         ("designer/commands/design.py", "import numpy", "numpy at once"),
-        ("designer/commands/verify.py", "from designer import certificate", "designer.certificate at once"),
+        ("designer/commands/verify.py", "from designer import certificate", "designer.proof.theorem1 at once"),
     ],
 )
 def test_a_planted_import_is_found(path: str, line: str, found: str) -> None:
@@ -171,21 +180,21 @@ def loaded(modules: str) -> set[str]:
     ("modules", "never"),
     [
         # a node: no solver, no pictures, no recorder
-        ("agent.cli, agent.bus, agent.roles.joining, agent.roles.node",
+        ("agent.cli, agent.network.bus, agent.roles.joining, agent.roles.node",
          "cvxpy clarabel scipy designer matplotlib rich mcap zstandard"),
-        ("agent.cli, agent.bus, agent.roles.plant, agent.roles.coordinator",
+        ("agent.cli, agent.network.bus, agent.roles.plant, agent.roles.coordinator",
          "cvxpy clarabel scipy designer matplotlib rich mcap zstandard"),
         ("agent.cli, agent.launch", "cvxpy clarabel scipy designer matplotlib rich mcap zenoh"),
-        ("agent.cli, agent.bus, agent.roles.recorder", "cvxpy clarabel scipy designer matplotlib rich"),
+        ("agent.cli, agent.network.bus, agent.roles.recorder", "cvxpy clarabel scipy designer matplotlib rich"),
         # the command line, before it knows what to do
         ("designer.cli", "numpy zenoh mcap cvxpy clarabel scipy flint matplotlib rich"),
         # replay: nothing of the nodes' arithmetic, no network
         ("designer.replay",
-         "agent.filter agent.inbox agent.roles agent.bus zenoh cvxpy clarabel scipy flint matplotlib"),
+         "agent.filter agent.inbox agent.roles agent.network.bus zenoh cvxpy clarabel scipy flint matplotlib"),
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver
-        ("designer.certificate, designer.exact_certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
+        ("designer.proof.theorem1, designer.proof.recursion", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
     ],
 )  # fmt: skip
 def test_a_process_loads_only_what_it_needs(modules: str, never: str) -> None:

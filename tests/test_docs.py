@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 import designer
 
-ROOT = Path(__file__).parents[1]
 DOCUMENTS = {path.name: path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 FILES = {
     path.relative_to(ROOT).as_posix(): path.read_text()

@@ -7,13 +7,13 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.analysis import analyse, load_given
 from designer.cli import main
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from agent.bus import Bus, Peer
 from agent.contract.errors import InputError, PeakmeshError, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import (
@@ -26,6 +25,7 @@ from agent.contract.messages import (
     sensor_who,
 )
 from agent.contract.schedule import modes
+from agent.network.bus import Bus, Peer
 from agent.plan import Plan
 
 REPORT_SECONDS = 0.1

@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from agent.bus import Bus, ChannelClosed, RunClosed
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import Control, participants
+from agent.network.bus import Bus, ChannelClosed, RunClosed
 
 
 def join(bus: Bus, gains: Gains) -> Control:

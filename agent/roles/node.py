@@ -7,7 +7,6 @@ from itertools import count
 import numpy as np
 from pydantic import ValidationError
 
-from agent.bus import Bus, Sample
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
@@ -15,6 +14,7 @@ from agent.contract.messages import MODE, Control, Estimate, decode, estimate, m
 from agent.contract.schedule import Deliveries
 from agent.filter import innovation, step
 from agent.inbox import Inbox
+from agent.network.bus import Bus, Sample
 from agent.roles.joining import take_part
 
 

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from agent.bus import Bus, Channel, RunClosed, Sample
 from agent.contract.errors import Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import (
@@ -25,7 +24,8 @@ from agent.contract.messages import (
     node_who,
 )
 from agent.contract.recording import Logged, RecordingWriter, refuse_recording
-from agent.ledger import Ledger
+from agent.network.bus import Bus, Channel, RunClosed, Sample
+from agent.receipts import Ledger
 from agent.roles.joining import join
 
 SHORTEST_PAUSE = 0.002  # s, while messages come; they wait in their channels meanwhile

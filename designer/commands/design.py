@@ -17,7 +17,7 @@ from designer.commands import PROBLEM
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
-    from designer.descent import Progress
+    from designer.search.descent import Progress
 
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
@@ -118,7 +118,7 @@ def design_and_save(
 
 def _chosen_method(problem: Problem) -> str:
     """The default for this problem; on stderr why, where it is not the best one or takes long."""
-    from designer.effort import LONG, default_method, in_words, seconds_of_exact
+    from designer.search.effort import LONG, default_method, in_words, seconds_of_exact
 
     method, seconds = default_method(problem), seconds_of_exact(problem)
     if method != "exact":

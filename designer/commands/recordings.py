@@ -46,6 +46,6 @@ def report_command(options: argparse.Namespace) -> int:
 
 def write_pictures(recording: Path, folder: Path, *, force: bool) -> list[str]:
     """Draw the pictures of a recording into a folder; returns the files."""
-    from designer import figures
+    from designer.report import figures
 
     return [str(path) for path in figures.write(recording, folder, force=force)]

@@ -98,7 +98,7 @@ def simulate_command(options: argparse.Namespace) -> int:
 
 def _worst_case(gains: Gains) -> Array:
     """The stored sequence, of energy 1, or where the file has none that of a new search."""
-    from designer.worst_case import worst_for
+    from designer.gain.worst_case import worst_for
 
     return worst_for(gains).w if gains.worst_case is None else gains.worst_case
 

@@ -25,7 +25,7 @@ def add_verify(commands: agent.cli.Subcommands) -> None:
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS`."""
-    from designer.certificate import verify
+    from designer.proof.theorem1 import verify
 
     gains = agent.cli.load_gains(options.gains)
     started = time.perf_counter()

@@ -33,15 +33,15 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import Solver
 from agent.contract.problem import Node, Problem
-from designer.error_model import measurement_slices
 from designer.lmi import LmiSolution, attempts, conic
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.cliques import clique_tree
 from designer.lmi.cones import Assembly, Cones, Indices, Inequality
-from designer.units import Units, natural_units, rescaled
+from designer.model.error_model import measurement_slices
+from designer.model.units import Units, natural_units, rescaled
 
 Link = tuple[int, int]  # (i, j): node i hears node j
-MARGIN = 1e-6  # of the balance, for unstable plants: designer.inwards knows no way inwards there
+MARGIN = 1e-6  # of the balance, for unstable plants: designer.lmi.inwards knows no way inwards there
 
 
 class Columns(NamedTuple):

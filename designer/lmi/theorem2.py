@@ -1,7 +1,7 @@
 """Theorem 2 of Zhu et al. 2020 as printed: LMI (36)(37) with objective (42), in the paper's letters.
 
 The solver is given the non-strict inequalities: a strict one has no optimum. Its answer therefore lies on the
-boundary, where (36) and (37) are singular; designer.back_off leads from there to a gamma that is checked.
+boundary, where (36) and (37) are singular; designer.lmi.back_off leads from there to a gamma that is checked.
 
 `reduced` stands for the state [x; e] in place of the paper's [1 kron x; e]; see `inequality_36`.
 """
@@ -23,11 +23,11 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.gains import Solver
 from agent.contract.problem import Problem
-from designer.error_model import Stacks, stacks
 from designer.lmi import LmiSolution, attempts, beyond_paper
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.conic import failure
-from designer.units import Units, natural_units, rescaled
+from designer.model.error_model import Stacks, stacks
+from designer.model.units import Units, natural_units, rescaled
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     cp.CLARABEL: {"chordal_decomposition_merge_method": "none"},  # three times faster than merging on six nodes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
+from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
 from designer.replay.topics import Numbers
 
 FLOOR = 1e-140  # magnitudes below it count as this: their squares underflow in the free run's bound

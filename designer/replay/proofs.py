@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.error_model import measurement_slices
+from designer.model.error_model import measurement_slices
 from designer.replay.central import FLOOR, Central, Flags
 from designer.replay.inputs import Drawn, Inputs, logged_plant
 from designer.replay.log import Log

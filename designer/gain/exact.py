@@ -1,0 +1,401 @@
+"""The exact gain of given gains: the least gamma of which sup_k E|z_tilde(k)|^2 <= gamma^2 E sum |w|^2 is true.
+
+w(k) may depend on the modes r(0..k) and on everything before step k, but not on what gets lost in step k or on later
+modes; the initial mode is any, the initial error is 0. That is the class that Theorem 1 covers. docs/theory.md,
+sections 1 to 3, derives what is written here; the letters are those of eqs. (10)(11), and g stands for gamma^2.
+In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.joint`, chance within.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from designer.model.error_model import ErrorModel, Indices, LinkTerms
+
+_WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
+_TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
+_UNSTABLE_HORIZON = 30  # where no horizon suffices
+_MOST_STEPS = 20_000
+_SPARSE = 1 / 12  # of the entries of [A B]; where fewer are not 0, zeros are left out: from about 40 nodes on
+_FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
+_STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
+
+
+class Gain(NamedTuple):
+    """gamma lies in [low, high]: low = gamma_T, high^2 = gamma_T^2 + tau_T^2, T = horizon.
+
+    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None.
+    """
+
+    low: float
+    high: float
+    horizon: int
+    tail: float  # tau_T^2
+    P: Array | None  # (modes, n_eta, n_eta), satisfies (17) strictly; the tail is measured by it
+    radius: float  # spectral radius of the operator L of `Operator.corner`: what E|eta|^2 is multiplied by, per step
+
+    @property
+    def stable(self) -> bool:
+        """Whether the error system is mean-square stable."""
+        return math.isfinite(self.high)
+
+
+class Operator:
+    """The matrices of (10)(11) in the shapes that the recursions multiply by."""
+
+    def __init__(self, model: ErrorModel) -> None:
+        modes, size, p = model.modes, model.size, model.plant_states
+        self.AB = np.concatenate([model.A, model.B], axis=2)  # (modes, n_eta, n_eta + nw)
+        self.AB_T = np.ascontiguousarray(self.AB.swapaxes(1, 2))
+        lossy = np.flatnonzero(model.alpha[model.owner] > 0.0)  # measurements that may be lost
+        owner, roots = model.owner[lossy], np.sqrt(model.alpha[model.owner[lossy]])
+        self.lossy = lossy
+        self.H = model.H[:, :, lossy] * roots  # sqrt(alpha_i) H of them, (modes, n nx, lossy)
+        self.H_T = np.ascontiguousarray(self.H.swapaxes(1, 2))
+        self.same = (owner[:, None] == owner).astype(np.float64)  # 1 where two measurements are lost together
+        self.R = model.R[lossy]
+        self.R_T = np.ascontiguousarray(self.R.T)
+        self.links = None if model.links is None else _Links(model.links, modes, size + model.nw, p)
+        self.MM = np.broadcast_to(model.M.T @ model.M, (modes, size, size))
+        self.M = model.M
+        self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
+        self.p, self.size, self.nw = p, size, model.nw
+        self.eye_w = np.eye(self.nw)
+
+    def bar(self, Y: Array) -> Array:
+        """Y_bar(s) = sum_t pi_st Y(t), (modes, n_eta, n_eta)."""
+        return np.asarray((self.transition @ Y.reshape(len(Y), -1)).reshape(Y.shape))
+
+    def joint(self, Y_bar: Array) -> Array:
+        """[A B]'Y_bar[A B] with the sum of alpha_i F_i'Y_bar F_i, and as much of links: what E|eta(k+1)|^2 weighs.
+
+        Y_bar is symmetric; the result is (modes, n_eta + nw, n_eta + nw).
+        """
+        S = self._full(Y_bar) if self.sparse is None else self.sparse.joint(Y_bar)
+        if self.links is not None:
+            self.links.add(S, Y_bar)
+        return S
+
+    def _full(self, Y_bar: Array) -> Array:
+        """`joint` without links. With F_i = -H_i R_i the sum is R'(H'Y_bar H, its blocks of each node)R."""
+        S = self.AB_T @ (Y_bar @ self.AB)
+        if len(self.lossy):
+            G = (self.H_T @ (Y_bar[:, self.p :, self.p :] @ self.H)) * self.same
+            S += self.R_T @ (G @ self.R)
+        return np.asarray(S)
+
+    @cached_property
+    def sparse(self) -> _Sparse | None:
+        """The same without the zeros, where these are most: a node of a large network hears few others."""
+        return _Sparse(self) if np.count_nonzero(self.AB) < _SPARSE * self.AB.size else None
+
+    def corner(self, Y: Array) -> Array:
+        """L(Y) = A'Y_bar A + sum of alpha_i F_i'Y_bar F_i, the mean of Y one step later, (modes, n_eta, n_eta)."""
+        return self.joint(self.bar(Y))[:, : self.size, : self.size]
+
+    def carry(self, joint: Array) -> Array:
+        """E[eta(k+1) eta(k+1)'; r(k+1)] by mode, (modes, n_eta, n_eta), from `joint`, that of [eta; w] at k.
+
+        The adjoint of L: `joint` has E[[eta; w][eta; w]'; r(k) = s] for every s, (modes, n_eta + nw, n_eta + nw).
+        """
+        X = self.AB @ joint @ self.AB_T
+        if len(self.lossy):
+            X[:, self.p :, self.p :] += self.H @ ((self.R @ joint @ self.R_T) * self.same) @ self.H_T
+        if self.links is not None:
+            self.links.carry(X, joint)
+        return np.asarray((self.transition.T @ X.reshape(len(X), -1)).reshape(X.shape))
+
+
+class _Sparse:
+    """`Operator.joint` without links for a large network; Y_bar is full all the same."""
+
+    def __init__(self, operator: Operator) -> None:
+        from scipy import sparse  # takes 0.2 s to import
+
+        modes, p, size = len(operator.AB), operator.p, operator.size
+        self.size, self.both = size, size + operator.nw
+        self.AB_T: Any = sparse.block_diag([sparse.csr_array(AB_T) for AB_T in operator.AB_T], format="csr")
+        a, b = np.nonzero(operator.same)  # pairs of measurements that are lost together
+        mode = np.arange(modes)[:, None, None, None]
+        rows, H = _kept(operator.H_T)  # (modes, lossy, r)
+        rows += p
+        self.at_HH = (mode * size + rows[:, a, :, None]) * size + rows[:, b, None, :]  # in Y_bar
+        self.HH = H[:, a, :, None] * H[:, b, None, :]  # (modes, pairs, r, r)
+        columns, R = _kept(operator.R)  # (lossy, c)
+        self.at_RR = (mode * self.both + columns[a, :, None]) * self.both + columns[b, None, :]  # in S
+        self.RR = R[a, :, None] * R[b, None, :]  # (pairs, c, c)
+
+    def joint(self, Y_bar: Array) -> Array:
+        """[A B]'([A B]'Y_bar)', and H_a'Y_bar H_b R_a'R_b of every pair (a, b)."""
+        half = (self.AB_T @ Y_bar.reshape(-1, self.size)).reshape(-1, self.both, self.size)
+        S = self.AB_T @ half.swapaxes(1, 2).reshape(-1, self.both)
+        G = (Y_bar.reshape(-1)[self.at_HH] * self.HH).sum(axis=(2, 3), keepdims=True)
+        S += np.bincount(self.at_RR.reshape(-1), (G * self.RR).reshape(-1), minlength=S.size).reshape(S.shape)
+        return np.asarray(S).reshape(-1, self.both, self.both)
+
+
+def _kept(X: Array) -> tuple[Indices, Array]:
+    """Where rows are not 0, and what is there: both (..., c), where the fullest row has c entries."""
+    most = int(np.count_nonzero(X, axis=-1).max(initial=0))
+    at = np.argsort(X == 0.0, axis=-1, kind="stable")[..., :most]
+    return at, np.take_along_axis(X, at, axis=-1)
+
+
+class _Links:
+    """What lossy links add to `Operator.joint`: V_l'Y_bar V_l for every term, at its columns."""
+
+    def __init__(self, links: LinkTerms, modes: int, order: int, p: int) -> None:
+        nx = links.V.shape[1]
+        self.roots = np.sqrt(links.variance)[:, None, None]
+        self.V = self.roots * links.V
+        self.V_T = np.ascontiguousarray(self.V.swapaxes(1, 2))
+        rows = p + links.receiver[:, None] * nx + np.arange(nx)  # (terms, nx)
+        self.block = links.mode[:, None, None], rows[:, :, None], rows[:, None, :]
+        self.columns = links.mode[:, None, None], links.columns[:, :, None], links.columns[:, None, :]
+        at = (links.mode[:, None, None] * order + links.columns[:, :, None]) * order + links.columns[:, None, :]
+        self.at = at.reshape(-1)  # where the entries of all terms go
+
+    def add(self, S: Array, Y_bar: Array) -> None:
+        """In place."""
+        terms = self.V_T @ (Y_bar[self.block] @ self.V)  # (terms, c, c)
+        S += np.bincount(self.at, weights=terms.reshape(-1), minlength=S.size).reshape(S.shape)
+
+    def carry(self, X: Array, joint: Array) -> None:
+        """Add V_l cov V_l' to the covariance X of eta one step later, in place; joint is that of [eta; w]."""
+        np.add.at(X, self.block, self.V @ (joint[self.columns] @ self.V_T))
+
+    def by_V(self, Y_bar: Array, joint: Array) -> Array:
+        """Derivative of sum tr(V_l'Y_bar V_l cov) by every V_l, summed over the steps, (terms, nx, c)."""
+        steps = zip(Y_bar, joint, strict=True)
+        return np.asarray(
+            2.0 * self.roots * sum(Y_k[self.block] @ (self.V @ joint_k[self.columns]) for Y_k, joint_k in steps)
+        )
+
+
+class Step(NamedTuple):
+    """One step of the recursion backwards, for w = Gamma eta, which is worst in it."""
+
+    Y_bar: Array  # (modes, n_eta, n_eta): what weighs eta(k+1)
+    W_inverse: Array  # (modes, nw, nw), W = g I - B'Y_bar B
+    Gamma: Array  # (modes, nw, n_eta): W^-1 B'Y_bar A
+    log_det: Array  # (modes,): of W / g
+    Y: Array  # (modes, n_eta, n_eta): what weighs eta(k)
+
+
+def step(operator: Operator, Y: Array, g: float) -> Step | None:
+    """Y <- L(Y) + A'Y_bar B W^-1 B'Y_bar A; None where a W is not positive definite."""
+    Y_bar, size = operator.bar(Y), operator.size
+    S = operator.joint(Y_bar)
+    factored = _factored(operator.eye_w - S[:, size:, size:] / g)
+    if factored is None:
+        return None
+    inverse, log_det = factored
+    W_inverse = inverse / g
+    Gamma = W_inverse @ S[:, size:, :size]
+    return Step(Y_bar, W_inverse, Gamma, log_det, S[:, :size, :size] + S[:, :size, size:] @ Gamma)
+
+
+def _factored(W: Array) -> tuple[Array, Array] | None:
+    """W^-1 and log det W of every mode, (modes, nw, nw) and (modes,); None where a W is not positive definite."""
+    if W.shape[-1] == 1:  # the same, in a fifth of the time
+        return (1.0 / W, np.log(W[:, 0, 0])) if (W > 0.0).all() else None
+    try:
+        L = np.linalg.cholesky(W)
+    except np.linalg.LinAlgError:
+        return None
+    L_inverse = np.linalg.inv(L)
+    return L_inverse.swapaxes(1, 2) @ L_inverse, 2.0 * np.log(L.diagonal(axis1=1, axis2=2)).sum(axis=1)
+
+
+class InvariantSet:
+    """All Y <= g P, for a P that satisfies (17): once in it, the recursion at g holds over any horizon.
+
+    (17) says that a step leads from g P to no more than g P, with W positive definite; and less Y leads to less, with
+    a larger W.
+    """
+
+    def __init__(self, P: Array) -> None:
+        P_inverse = np.linalg.inv(P)
+        self.P = P  # (modes, n_eta, n_eta)
+        self.P_inverse = (P_inverse + P_inverse.swapaxes(1, 2)) / 2.0
+
+    def contains(self, Y: Array, g: float) -> bool:
+        """Cholesky decides, once the sum of all eigenvalues of Y relative to P, which is cheap, is at most g."""
+        if np.vdot(Y, self.P_inverse) > g:
+            return False
+        try:
+            np.linalg.cholesky(g * self.P - Y)
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+
+def horizon_holds(
+    operator: Operator, g: float, horizon: int, *, invariant: InvariantSet | None = None
+) -> tuple[bool, float]:
+    """Whether gamma_T^2 <= g: every W positive definite; and sum_k min_s log det(W / g), a measure of how far.
+
+    Steps and sum end early in an invariant set.
+    """
+    Y, total = operator.MM, 0.0
+    for _ in range(horizon):
+        taken = step(operator, Y, g)
+        if taken is None:
+            return False, -math.inf
+        Y = taken.Y
+        total += float(taken.log_det.min())
+        if invariant is not None and invariant.contains(Y, g):
+            break
+    return True, total
+
+
+@np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
+def exact_gain(model: ErrorModel) -> Gain:
+    """The exact gain of an error model, between bounds that differ by 1e-6 of it at most; T is chosen on the way."""
+    np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
+    operator = Operator(model)
+    P, radius = lyapunov(operator)
+    if P is None:
+        low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
+        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, math.inf, None, radius)
+    invariant = InvariantSet(P)
+    horizon, tail, impulse = _horizon(operator, invariant)
+    low, high = horizon_gain(operator, horizon, above=impulse, invariant=invariant)
+    return Gain(math.sqrt(low), math.sqrt(high + tail), horizon, tail, P, radius)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def horizon_gain(
+    operator: Operator,
+    horizon: int,
+    *,
+    width: float = _WIDTH,
+    above: float | None = None,
+    invariant: InvariantSet | None = None,
+) -> tuple[float, float]:
+    """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high.
+
+    `above` is a lower bound of gamma_T^2, where the search begins.
+
+    As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
+    recursion held give p and the root; where that leads nowhere, g is tried a fifth above low.
+    """
+    low, growth, tiny = 0.0, 2.0, float(np.finfo(float).tiny)
+    g = growth * max(_impulse(operator) if above is None else above, tiny)
+    held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
+    while not held or held[-1][0] > max(low * (1.0 + 1.001 * width), 2.0 * tiny):
+        if not math.isfinite(g):
+            return low, math.inf
+        holds, measure = horizon_holds(operator, g, horizon, invariant=invariant)
+        if holds:
+            held = [*held[-2:], (g, measure)]
+        else:
+            low, growth = g, growth * growth
+        g = _next_trial(low, held, width, fit=holds) if held else growth * low
+    return low, held[-1][0]
+
+
+def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:
+    """Where to try g next, strictly inside the bracket: at the fitted root, or a fifth above low after that failed."""
+    (high, measure), least = held[-1], 0.4 * width
+    root = None
+    if fit:
+        root = _root(low, held) if len(held) == 3 else -high * math.expm1(measure)  # as if one W did it all
+    if high - low < 8.0 * width * high:  # close the bracket from the other side
+        root = (root or low) if high > low * (1.0 + 3.0 * least) else None
+    if root is None:
+        return low + 0.2 * (high - low)  # fits fall short by little; and to fail takes fewer steps than to hold
+    if high < root * (1.0 + least):
+        root = high * (1.0 - 2.0 * least)
+    elif low > root * (1.0 - least):
+        root = low * (1.0 + 2.0 * least)
+    return min(max(root, low * (1.0 + least)), high * (1.0 - least))
+
+
+def _root(low: float, held: list[tuple[float, float]]) -> float | None:
+    """r of measure = a + p log(g - r) through three points (g, measure); None if there is none above `low`."""
+    (g1, m1), (g2, m2), (g3, m3) = held
+
+    def excess(r: float) -> float:
+        return math.log((g1 - r) / (g2 - r)) * (m2 - m3) - math.log((g2 - r) / (g3 - r)) * (m1 - m2)
+
+    left, right = low, g3 * (1.0 - 1e-15)
+    if not (m1 > m2 > m3 and excess(left) > 0.0 > excess(right)):
+        return None
+    for _ in range(50):
+        middle = (left + right) / 2.0
+        left, right = (middle, right) if excess(middle) > 0.0 else (left, middle)
+    return left
+
+
+def _impulse(operator: Operator) -> float:
+    """gamma_1^2: the gain of one step of w."""
+    S_ww = operator.joint(operator.MM)[:, operator.size :, operator.size :]
+    return float(np.linalg.eigvalsh(S_ww).max()) if np.isfinite(S_ww).all() else math.inf
+
+
+def lyapunov(operator: Operator) -> tuple[Array | None, float]:
+    """P(s) that satisfies (17) strictly, (modes, n_eta, n_eta), and the spectral radius of L.
+
+    P0 = I + L(I) + ... + L^k(I) with L^(k+1)(I) < I/2 has V = P0 - L(P0) > I/2. By Schur's complement c P0
+    satisfies (17) if and only if I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where the powers of L
+    grow, at a rate that has settled.
+    """
+    term = np.broadcast_to(np.eye(operator.size), operator.MM.shape)
+    P0, sizes = term.copy(), [0.0]  # logarithms of the norms of L^k(I)
+    while len(sizes) < _MOST_STEPS:
+        term = operator.corner(term)
+        largest = float(np.abs(term).sum(axis=2).max())
+        sizes.append(math.log(largest) if largest > 0.0 else -math.inf)
+        if largest < 0.5:  # a bound on every eigenvalue
+            return _scaled(operator, P0, term), _rate(sizes)
+        if _grows(sizes):
+            break
+        P0 = P0 + term
+    return None, _rate(sizes)
+
+
+def _scaled(operator: Operator, P0: Array, last: Array) -> Array:
+    """c P0 with the largest c that (17) allows, but for the factor _STRICT; last = L^(k+1)(I)."""
+    V = np.eye(operator.size) - last  # P0 - L(P0)
+    S = operator.joint(operator.bar(P0))
+    AB, BB = S[:, : operator.size, operator.size :], S[:, operator.size :, operator.size :]
+    worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
+    return np.asarray(P0 / (worst * _STRICT))
+
+
+def _rate(sizes: list[float]) -> float:
+    """Growth per step over the last half."""
+    half = (len(sizes) - 1) // 2
+    return math.exp((sizes[-1] - sizes[half]) / (len(sizes) - 1 - half))
+
+
+def _grows(sizes: list[float]) -> bool:
+    """Whether the norms grow at a rate that has settled, so that it is no transient; asked at steps 32, 64, 128, ..."""
+    k = len(sizes) - 1
+    if k < 32 or k & (k - 1):
+        return False
+    early, late = sizes[k // 2] - sizes[k // 4], sizes[k] - sizes[k // 2]
+    return late > 0.0 and abs(late - 2.0 * early) < 0.02 * late
+
+
+def _horizon(operator: Operator, invariant: InvariantSet) -> tuple[int, float, float]:
+    """The first T at which tau_T^2 is small beside gamma^2, tau_T^2, and the most that one step of w gains.
+
+    tau_T^2 = max_s lambda_max(L^T(M'M) relative to P).
+    """
+    Y, size, steps, impulse = operator.MM, operator.size, 0, 0.0
+    while steps < 2 or float((Y * invariant.P_inverse).sum(axis=(1, 2)).max()) > _TAIL * impulse:  # trace >= eigenvalue
+        S = operator.joint(operator.bar(Y))
+        impulse = max(impulse, float(np.linalg.eigvalsh(S[:, size:, size:]).max()))  # <= gamma^2: one step of w
+        Y, steps = S[:, :size, :size], steps + 1
+    L = np.linalg.cholesky(invariant.P)
+    half = np.linalg.solve(L, Y)
+    relative = np.linalg.solve(L, half.swapaxes(1, 2))
+    tail = float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max())
+    return steps, tail, impulse

@@ -1,0 +1,181 @@
+"""The error model in ball arithmetic, built link by link from the numbers of the gains file as they stand.
+
+It shares no code with designer.model.error_model, and takes a_ij K_ij, beta(1 - beta) and A - sum of a_ij K_ij as exact
+products and sums of stored floats. In mode s (docs/theory.md, section 9; it is (10)(11) of the paper where losses are
+hidden and no link loses messages)
+
+    eta+ = [A B][eta; w] + sum over l of xi_l E_l C_l [eta; w],
+
+where the xi_l have mean 0, are uncorrelated, and are independent of eta and w: theta_j - beta_j, phi_ij - rho_ij, and
+the products of both.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from flint import arb, arb_mat
+from numpy.typing import NDArray
+
+from agent.contract.gains import LinkMatrices
+from agent.contract.problem import Problem
+from designer.proof.balls import add, exact, identity, part
+
+
+class Noise(NamedTuple):
+    """One xi_l: its variance, and E_l C_l by the rows of eta+ and columns of [eta; w] where they are not zero."""
+
+    variance: arb
+    rows: list[int]
+    E: arb_mat  # (len(rows), r)
+    columns: list[int]
+    C: arb_mat  # (r, len(columns))
+
+
+class Sensor(NamedTuple):
+    """What node j measures: its mean innovation is C_mean e_j + D_mean w; a loss takes `lost` [eta; w] from it."""
+
+    C_mean: arb_mat  # beta_j C_j
+    D_mean: arb_mat  # D_j, or beta_j D_j where the loss is seen
+    alpha: arb  # beta_j (1 - beta_j)
+    columns: list[int]  # of `lost`
+    lost: arb_mat  # C_j over x, or [C_j, D_j] over (e_j, w) where the loss is seen
+
+
+class BallModel:
+    """[A B] and the noise of every mode, M, and the chain; eta = [x; e_1; ...; e_n], or e alone where x drops out."""
+
+    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
+        nx, n = problem.nx, problem.n
+        p = problem.plant_states
+        self.size, self.nw = p + n * nx, problem.nw
+        self.x = list(range(p))
+        self.e = [list(range(p + i * nx, p + (i + 1) * nx)) for i in range(n)]
+        self.eta = list(range(self.size))
+        self.w = list(range(self.size, self.size + problem.nw))
+        self.M = arb_mat(n * problem.nz, self.size)
+        for i in range(n):
+            add(self.M, range(i * problem.nz, (i + 1) * problem.nz), self.e[i], exact(problem.plant.M))
+        self.transition = []  # rows renormalised: they sum to 1 within the problem's tolerance only
+        for row in problem.markov.transition.tolist():
+            total = sum((arb(pi) for pi in row), arb(0))
+            self.transition.append([arb(pi) / total for pi in row])
+        self.sensors = [self._sensor(problem, j) for j in range(n)]
+        self.AB: list[arb_mat] = []  # (n_eta, n_eta + nw), of every mode
+        self.filled: list[NDArray[np.bool_]] = []  # where AB may be other than exactly 0
+        self.noise: list[list[Noise]] = []
+        for s in range(len(problem.topologies)):
+            self.AB.append(arb_mat(self.size, self.size + self.nw))
+            self.filled.append(np.zeros((self.size, self.size + self.nw), dtype=bool))
+            self.noise.append(self._mode(problem, s, K, H))
+
+    def _add(self, s: int, rows: list[int], columns: list[int], block: arb_mat) -> None:
+        add(self.AB[s], rows, columns, block)
+        self.filled[s][np.ix_(rows, columns)] = True
+
+    def _sensor(self, problem: Problem, j: int) -> Sensor:
+        node = problem.nodes[j]
+        C, D, beta = exact(node.C), exact(node.D), arb(node.arrival_probability)
+        columns, lost = self.x, C
+        if node.seen:
+            ny = C.nrows()
+            columns, lost = self.e[j] + self.w, arb_mat(ny, problem.nx + problem.nw)
+            add(lost, range(ny), range(problem.nx), C)
+            add(lost, range(ny), range(problem.nx, problem.nx + problem.nw), D)
+        return Sensor(C * beta, D * beta if node.seen else D, beta * (1 - beta), columns, lost)
+
+    def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> list[Noise]:
+        """Fill in [A B] of mode s; its noise. K and H have the weights a_ij within from here on."""
+        A, B, nx = exact(problem.plant.A), exact(problem.plant.B), problem.nx
+        topology, names, heard = problem.topologies[s], problem.node_names, problem.neighbours
+        noise = []
+        carried: list[list[tuple[list[int], arb_mat]]] = [[] for _ in names]  # of j: where its innovation goes, and how
+        if self.x:
+            self._add(s, self.x, self.x, A)
+            self._add(s, self.x, self.w, B)
+        for i, receiver in enumerate(names):
+            weights = {j: arb(topology.adjacency[i, j].item()) for j in heard(s, i)}
+            K_i = {j: exact(K[topology.name][receiver][names[j]]) * a_ij for j, a_ij in weights.items()}
+            H_i = {j: exact(H[topology.name][receiver][names[j]]) * a_ij for j, a_ij in weights.items()}
+            others = sum((K_i[j] for j in K_i if j != i), arb_mat(nx, nx))
+            if problem.unbiased:
+                K_i[i] = A - others  # what the node steps by; the file has it rounded
+            elif self.x:
+                self._add(s, self.e[i], self.x, A - others - K_i[i])
+            self._add(s, self.e[i], self.w, B)
+            for j in weights:
+                sensor, rho = self.sensors[j], arb(problem.delivery[i, j].item())
+                by_e, by_w = K_i[j] - H_i[j] * sensor.C_mean, -(H_i[j] * sensor.D_mean)
+                self._add(s, self.e[i], self.e[j], by_e * rho)
+                self._add(s, self.e[i], self.w, by_w * rho)
+                carried[j].append((self.e[i], H_i[j] * -rho))
+                if rho == 1:
+                    continue
+                self._add(s, self.e[i], self.e[i], K_i[j] * (1 - rho))
+                lossy = rho * (1 - rho)
+                noise.append(self._of_link(i, j, lossy, K_i[j], by_e, by_w))
+                if sensor.alpha > 0:
+                    noise.append(Noise(lossy * sensor.alpha, self.e[i], -H_i[j], sensor.columns, sensor.lost))
+        noise += [self._of_sensor(j, carried[j]) for j in range(problem.n) if self.sensors[j].alpha > 0]
+        return noise
+
+    def _of_link(self, i: int, j: int, variance: arb, K_ij: arb_mat, by_e: arb_mat, by_w: arb_mat) -> Noise:
+        """A message that arrives: K_ij (e_j - e_i) less H_ij times node j's mean innovation, in e_i."""
+        nx, nw = K_ij.nrows(), self.nw
+        C = arb_mat(nx, 2 * nx + nw)
+        for first, block in ((0, -K_ij), (nx, by_e), (2 * nx, by_w)):
+            add(C, range(nx), range(first, first + block.ncols()), block)
+        return Noise(variance, self.e[i], identity(nx), self.e[i] + self.e[j] + self.w, C)
+
+    def _of_sensor(self, j: int, carried: list[tuple[list[int], arb_mat]]) -> Noise:
+        """A measurement that arrives: what a loss takes, in the errors of all who hear node j."""
+        sensor = self.sensors[j]
+        ny = sensor.lost.nrows()
+        rows = [row for part_rows, _ in carried for row in part_rows]
+        E = arb_mat(len(rows), ny)
+        for k, (part_rows, block) in enumerate(carried):
+            first = k * len(part_rows)
+            add(E, range(first, first + len(part_rows)), range(ny), block)
+        return Noise(sensor.alpha, rows, E, sensor.columns, sensor.lost)
+
+    @property
+    def modes(self) -> range:
+        return range(len(self.AB))
+
+    @property
+    def MM(self) -> arb_mat:
+        """M'M: what |z_tilde|^2 is of eta, (n_eta, n_eta)."""
+        MM, nz = arb_mat(self.size, self.size), self.M.nrows() // len(self.e)
+        for i, e_i in enumerate(self.e):
+            M_i = part(self.M, range(i * nz, (i + 1) * nz), e_i)
+            add(MM, e_i, e_i, M_i.transpose() * M_i)
+        return MM
+
+    def joint(self, Y: list[arb_mat], partition: list[list[int]] | None = None) -> list[arb_mat]:
+        """E|eta+|^2 weighed by Y(t), t the next mode, as a quadratic form in [eta; w], for every mode.
+
+        [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw). `partition`: the
+        blocks of every Y(t), where they are known; else it is taken as one.
+        """
+        return [self._joint(s, Y, partition or [self.eta]) for s in self.modes]
+
+    def _joint(self, s: int, Y: list[arb_mat], partition: list[list[int]]) -> arb_mat:
+        Y_bar = sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
+        S = self._mean(s, Y_bar, partition)
+        for noise in self.noise[s]:
+            core = noise.E.transpose() * part(Y_bar, noise.rows, noise.rows) * noise.E
+            add(S, noise.columns, noise.columns, noise.C.transpose() * core * noise.C * noise.variance)
+        return S
+
+    def _mean(self, s: int, Y_bar: arb_mat, partition: list[list[int]]) -> arb_mat:
+        """[A B]'Y_bar[A B], by the blocks of Y_bar: those of a P = diag{R, Q_1, ...} meet few columns of [A B] each."""
+        AB = self.AB[s]
+        if len(partition) == 1:
+            return AB.transpose() * (Y_bar * AB)
+        S = arb_mat(AB.ncols(), AB.ncols())
+        for rows in partition:
+            columns = np.flatnonzero(self.filled[s][rows].any(axis=0)).tolist()
+            AB_rows = part(AB, rows, columns)
+            add(S, columns, columns, AB_rows.transpose() * (part(Y_bar, rows, rows) * AB_rows))
+        return S

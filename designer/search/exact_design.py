@@ -1,0 +1,177 @@
+"""From a problem to gains designed for the exact gain, with a certificate of kind "exact"; and one for any gains."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.errors import Unattainable
+from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
+from agent.contract.problem import Problem
+from designer.gain.exact import Gain, exact_gain
+from designer.gain.floor import floor
+from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
+from designer.proof.recursion import check_exact
+from designer.proof.theorem1 import Verdict
+from designer.search.descent import Descent, Progress, descend
+from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
+
+_LMI_STARTS = ("theorem2", "decomposed")
+_LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
+_LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
+_LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
+_ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
+
+
+def design_exact(
+    problem: Problem,
+    *,
+    starts: Mapping[str, StackedGains] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Gains:
+    """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
+
+    KeyboardInterrupt ends the search; the best so far is returned.
+    """
+    started = time.perf_counter()
+    if math.isinf(floor(problem)):
+        raise Unattainable(
+            f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
+            "the plant that the disturbance drives; measure it"
+        )
+    starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
+    lmi_exact = next((exact_bounds(problem, *starts[name]) for name in _LMI_STARTS if name in starts), None)
+    if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
+        lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
+    begun = time.perf_counter()
+    descent = descend(problem, starts, progress=progress)
+    solved = time.perf_counter()
+    chosen = descent.chosen
+    if not chosen.gain.stable:
+        raise Unattainable(
+            f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
+            f"{chosen.gain.radius:.6g} in each step, and less than 1 is needed; {_advice(problem)}"
+        )
+    K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
+    certificate = certify(problem, K, H)
+    certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
+    ended = time.perf_counter()
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method="exact",
+        K=K,
+        H=H,
+        certificate=certificate,
+        solver=Solver(
+            name="barrier descent, numpy",
+            version=np.__version__,
+            status=_status(descent),
+            iterations=descent.steps,
+            seconds=solved - begun,
+        ),
+        seconds={
+            "starts": begun - started,
+            "solve": solved - begun,
+            "certify": ended - solved,
+            "total": ended - started,
+        },
+    )
+
+
+def with_ladder(problem: Problem, K: LinkMatrices, H: LinkMatrices, certificate: Certificate) -> Certificate:
+    """The certificate with the exact gain of the gains, unless the network is large, and the floor."""
+    exact = None
+    if problem.n * problem.nx <= _LADDER_STATES:
+        exact = exact_bounds(problem, *stacked_links(problem, K, H))
+    return certificate.model_copy(update={"exact": exact, "floor": floor(problem)})
+
+
+def exact_bounds(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[float, float] | None:
+    """The interval that the exact gain lies in; None where the errors are not mean-square stable."""
+    gain = exact_gain(error_model(problem, K_bar, H_bar))
+    return (gain.low, gain.high) if gain.stable else None
+
+
+def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
+    """Gains to start from, and gamma of the LMI where that gave one of them."""
+    starts = {
+        "least variance": least_variance_gains(problem),
+        f"consensus {WEIGHT}": consensus_gains(problem),
+    }
+    if problem.n * problem.nx > _LMI_STATES:
+        return starts, None
+    from designer.lmi import beyond_paper, decomposed, theorem2  # cvxpy takes seconds to import
+    from designer.synthesis import recover
+
+    name = "decomposed" if beyond_paper(problem) else "theorem2"
+    try:
+        solution = decomposed.solve(problem) if beyond_paper(problem) else theorem2.solve(problem, reduced=True)
+        gains = recover(problem, solution)
+    except Unattainable:
+        return starts, None  # one start less
+    if np.isfinite(gains[0]).all() and np.isfinite(gains[1]).all():
+        starts[name] = gains
+    return starts, solution.gamma
+
+
+def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
+    """gamma just above the exact gain of any gains of (5), proved; or Unattainable."""
+    gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
+    if gain.P is None:
+        raise Unattainable(
+            f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
+            "in each step, and less than 1 is needed"
+        )
+    verdict = _confirmed(problem, K, H, gain, gain.P)
+    if not verdict.holds:
+        raise Unattainable(
+            f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
+            f"({verdict.failure}); try the problem in other units, so that its numbers are near 1"
+        )
+    return Certificate(
+        gamma=verdict.gamma,
+        kind="exact",
+        form="full",
+        P=dict(zip(problem.mode_names, gain.P, strict=True)),
+        horizon=gain.horizon,
+        exact=(gain.low, gain.high),
+        floor=floor(problem),
+        holds=verdict.holds,
+        verified=f"(17) for P, the recursion of the exact gain over the horizon and its tail: {verdict.arithmetic}",
+        margins=verdict.margins,
+    )
+
+
+def _advice(problem: Problem) -> str:
+    radius = problem.plant.spectral_radius
+    if radius < 1.0:
+        return "try --method decomposed"
+    return (
+        f"A itself has spectral radius {radius:.6g}: let more measurements and messages arrive, or let every node "
+        "hear what shows the unstable part"
+    )
+
+
+def _confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, P: Array) -> Verdict:
+    for factor in _ABOVE:
+        gamma = gain.high * factor
+        verdict = check_exact(problem, K, H, P=P, gamma=gamma, horizon=gain.horizon)
+        if verdict.holds:
+            break
+    return verdict
+
+
+def _status(descent: Descent) -> str:
+    """What was found from where, and what the chosen gains trade for their size and decay."""
+    found = ", ".join(f"{name} {gamma:.6g}" for name, gamma in descent.starts.items())
+    chosen, least = descent.chosen, descent.least
+    return (
+        f"{'interrupted' if descent.interrupted else 'converged'}; starts led to {found or 'nothing yet'}; "
+        f"least {least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
+        f"chosen {chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
+    )

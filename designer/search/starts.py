@@ -1,0 +1,181 @@
+"""Gains to start the descent from, made without a solver, for any size of network.
+
+Kalman-consensus gains: in every mode node i predicts as if its neighbourhood never changed, by the Riccati equation
+of the sensors that it hears, with lost measurements and messages taken as more noise; and it draws its estimate
+towards those of its neighbours. For losses that are seen this Riccati equation is the one of intermittent
+observations (Sinopoli et al., IEEE Transactions on Automatic Control 49(9), 2004), for a gain that is constant.
+
+Gains of least variance: the same thought, but for the network as it is. The covariance of all errors under white w is
+carried forward, and in every step each node takes the gains that leave the least mean square of its next error.
+Where that covariance settles, the error system is mean-square stable, so these are a start for unstable plants too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.problem import Problem
+from designer.gain.exact import Operator
+from designer.model.error_model import StackedGains, error_model, measurement_slices, rows_total
+
+WEIGHT = 0.4  # of the neighbours' estimates together
+_MOST_STEPS = 1000
+_STEPS_OF_NETWORK = 300
+_SETTLED_NETWORK = 1e-6
+_RESTARTS = 0.01  # so that a mode that the chain leaves for ever has gains of its own too
+_STIRRED = 1e-4  # white noise on every error, beside w: so that no direction goes unseen
+_BOUNDLESS = 1e100
+
+
+def consensus_gains(problem: Problem, *, weight: float = WEIGHT) -> StackedGains:
+    """Kalman-consensus gains; the neighbours' estimates share `weight`.
+
+    The blocks of each row of K_bar, a_ij K_ij, sum to A: the gains are unbiased.
+    """
+    nx, A, columns = problem.nx, problem.plant.A, measurement_slices(problem)
+    K_bar = np.zeros((len(problem.topologies), problem.n * nx, problem.n * nx))
+    H_bar = np.zeros((len(problem.topologies), problem.n * nx, rows_total(problem)))
+    spread = _plant_covariance(problem) if problem.carries_plant else np.zeros((nx, nx))
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            heard, rows = problem.neighbours(s, i), slice(i * nx, (i + 1) * nx)
+            others = len(heard) - 1
+            for j in heard:
+                share = 1.0 if not others else 1.0 - weight if j == i else weight / others
+                K_bar[s, rows, j * nx : (j + 1) * nx] = share * A
+            at = np.concatenate([np.arange(columns[j].start, columns[j].stop) for j in heard])
+            H_bar[s][rows, at] = _predictor_gain(problem, i, heard, spread)
+    return K_bar, H_bar
+
+
+def _predictor_gain(problem: Problem, i: int, heard: tuple[int, ...], spread: Array) -> Array:
+    """L = (A P C' + B D')(C P C' + D D' + losses)^-1 of the nodes `heard` by node i, (nx, their measurements).
+
+    C and D stand for the means of what arrives, so with rho beta. What theta and phi do beside that is noise.
+    """
+    A, B, nodes = problem.plant.A, problem.plant.B, [problem.nodes[j] for j in heard]
+    rho, beta = problem.delivery[i, list(heard)], problem.beta[list(heard)]
+    mean_D = [b if node.seen else 1.0 for b, node in zip(beta, nodes, strict=True)]
+    C = np.vstack([b * node.C for b, node in zip(beta, nodes, strict=True)])  # of the messages
+    D = np.vstack([b * node.D for b, node in zip(mean_D, nodes, strict=True)])
+    sizes = [len(node.C) for node in nodes]
+    arrives, owner = np.repeat(rho, sizes), np.repeat(np.arange(len(nodes)), sizes)
+    together = owner[:, None] == owner
+    P, BB = B @ B.T, B @ B.T
+    for _ in range(_MOST_STEPS):
+        mean = C @ P @ C.T + D @ D.T
+        innovation = arrives[:, None] * arrives * mean + (arrives * (1.0 - arrives)) * together * mean
+        for j, node in enumerate(nodes):
+            lost = node.C @ P @ node.C.T + node.D @ node.D.T if node.seen else node.C @ spread @ node.C.T
+            rows = np.ix_(owner == j, owner == j)
+            innovation[rows] += rho[j] * beta[j] * (1.0 - beta[j]) * lost
+        cross = (A @ P @ C.T + B @ D.T) * arrives
+        L = cross @ np.linalg.pinv(innovation, rcond=1e-10, hermitian=True)
+        P_next = A @ P @ A.T + BB - L @ cross.T
+        if np.abs(P_next - P).max() <= 1e-10 * np.abs(P).max() or np.abs(P_next).max() > _BOUNDLESS:
+            break
+        P = (P_next + P_next.T) / 2.0
+    return np.asarray(L)
+
+
+def _plant_covariance(problem: Problem) -> Array:
+    """X = A X A' + B B': where white w keeps the plant; the sum by doubling, A is stable."""
+    power, X = problem.plant.A, problem.plant.B @ problem.plant.B.T
+    while np.abs(power).max() > 1e-12:
+        X = X + power @ X @ power.T
+        power = power @ power
+    return np.asarray(X)
+
+
+def least_variance_gains(problem: Problem) -> StackedGains:
+    """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
+    modes, nx, columns = len(problem.topologies), problem.nx, measurement_slices(problem)
+    regressions = {(s, i): node_regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
+    chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
+    chain /= chain.sum(axis=1, keepdims=True)
+    occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
+    K_bar = np.zeros((modes, problem.n * nx, problem.n * nx))
+    H_bar = np.zeros((modes, problem.n * nx, rows_total(problem)))
+    size = problem.plant_states + problem.n * nx
+    fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
+    X = fresh
+    joint = np.zeros((modes, size + problem.nw, size + problem.nw))
+    joint[:, size:, size:] = occupied[:, None, None] * np.eye(problem.nw)
+    for _ in range(_STEPS_OF_NETWORK):
+        joint[:, :size, :size] = X
+        for (s, i), regression in regressions.items():
+            rows, best = slice(i * nx, (i + 1) * nx), regression.best(joint[s])
+            for j, part in regression.K.items():
+                K_bar[s, rows, j * nx : (j + 1) * nx] = best[:, part]
+            for j, part in regression.H.items():
+                H_bar[s, rows, columns[j]] = best[:, part]
+            if problem.unbiased:
+                others = sum((best[:, part] for part in regression.K.values()), np.zeros((nx, nx)))
+                K_bar[s, rows, rows] = problem.plant.A - others
+        operator = Operator(error_model(problem, K_bar, H_bar))
+        operator.transition = chain
+        X_next = operator.carry(joint) + fresh
+        change = np.abs(X_next - X).max()
+        X = (X_next + X_next.swapaxes(1, 2)) / 2.0
+        if change <= _SETTLED_NETWORK * np.abs(X).max() or np.abs(X).max() > _BOUNDLESS:
+            break
+    return K_bar, H_bar
+
+
+class Regression(NamedTuple):
+    """e_i(k+1) = t - sum_j K_ij a_j - sum_j H_ij phi_ij nu_j of one node and mode, over [eta; w].
+
+    The regressors are all a_j and phi_ij nu_j. Where gains are unbiased t = A e_i + B w and
+    a_j = phi_ij (e_i - e_j), j != i; elsewhere t = A x + B w and a_j = phi_ij x_hat_j + (1 - phi_ij) x_hat_i.
+    """
+
+    t: Array  # (nx, n_eta + nw)
+    mean: Array  # (regressors, n_eta + nw)
+    noises: list[Array]  # what chance adds to the mean, each times something of variance 1
+    K: dict[int, slice]  # where a_j stands
+    H: dict[int, slice]  # where phi_ij nu_j stands
+
+    def best(self, joint: Array) -> Array:
+        """[K H] = E[t r'] E[r r']^-1, (nx, regressors), where [eta; w] has the covariance `joint`."""
+        noise = sum((V @ joint @ V.T for V in self.noises), np.zeros((len(self.mean), len(self.mean))))
+        gram = self.mean @ joint @ self.mean.T + noise
+        scale = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
+        inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True)
+        return np.asarray((self.t @ joint @ self.mean.T * scale) @ inverse * scale)
+
+
+def node_regression(problem: Problem, s: int, i: int) -> Regression:
+    """What node i regresses its next error on, in mode s."""
+    nx, plant, p = problem.nx, problem.plant, problem.plant_states
+    heard, at_w, eye = problem.neighbours(s, i), p + problem.n * problem.nx, np.eye(problem.nx)
+    others = [j for j in heard if not problem.unbiased or j != i]
+    K = {j: slice(k * nx, (k + 1) * nx) for k, j in enumerate(others)}
+    ends = len(others) * nx + np.cumsum([0, *(len(problem.nodes[j].C) for j in heard)])
+    H = {j: slice(int(ends[k]), int(ends[k + 1])) for k, j in enumerate(heard)}
+
+    def e(j: int) -> slice:
+        return slice(p + j * nx, p + (j + 1) * nx)
+
+    t = np.zeros((nx, at_w + problem.nw))
+    t[:, e(i) if problem.unbiased else slice(p)], t[:, at_w:] = plant.A, plant.B
+    mean, noises = np.zeros((int(ends[-1]), at_w + problem.nw)), []
+    for j in heard:
+        node, beta, rho = problem.nodes[j], problem.beta[j], problem.delivery[i, j]
+        sent, lost = np.zeros_like(mean), np.zeros_like(mean)  # what phi_ij multiplies, and phi_ij (theta_j - beta_j)
+        if j in K:
+            if not problem.unbiased:
+                mean[K[j], :p], mean[K[j], e(i)] = eye, -eye  # x_hat_i
+            sent[K[j], e(i)] += eye
+            sent[K[j], e(j)] -= eye
+        sent[H[j], e(j)], sent[H[j], at_w:] = beta * node.C, (beta if node.seen else 1.0) * node.D
+        if node.seen:
+            lost[H[j], e(j)], lost[H[j], at_w:] = node.C, node.D
+        elif beta < 1.0:
+            lost[H[j], :p] = node.C
+        mean += rho * sent
+        noises += [np.sqrt(rho * (1.0 - rho)) * sent] if rho < 1.0 else []
+        noises += [np.sqrt(rho * beta * (1.0 - beta)) * lost] if beta < 1.0 else []
+    return Regression(t, mean, noises, K, H)

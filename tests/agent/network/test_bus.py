@@ -1,0 +1,189 @@
+"""One place on the network and another, over real Zenoh on loopback, in one process."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from agent.contract.errors import InputError, Interrupted, RunBroken
+from agent.contract.messages import COORDINATOR, MODE, PLANT, RECORDER, Acknowledged, Control, Mode
+from agent.network.bus import Bus, Network, Peer, RunClosed, Sample
+
+PATIENCE = 20.0
+
+
+@pytest.fixture
+def coordinator() -> Iterator[Bus]:
+    with Bus(Network(wait=PATIENCE), run="test", who=COORDINATOR) as bus:
+        bus.advertise([MODE])
+        bus.enter()
+        yield bus
+
+
+@pytest.fixture
+def recorder(coordinator: Bus) -> Iterator[Bus]:
+    """Joined after the coordinator, which has then seen it."""
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), run="test", who=RECORDER) as bus:
+        bus.enter()
+        assert list(bus.meet([COORDINATOR])) == [COORDINATOR]
+        assert list(coordinator.meet([RECORDER])) == [RECORDER]
+        yield bus
+
+
+def publish(bus: Bus, steps: range) -> None:
+    for step in steps:
+        bus.publish(MODE, Mode(step=step, mode="a"))
+
+
+def acknowledged(received: int, *, closed: bool = False) -> Acknowledged:
+    return Acknowledged(
+        steps=received,
+        messages=received,
+        missing=0,
+        received={COORDINATOR: received},
+        reached={},
+        lacking=[],
+        closed=closed,
+    )
+
+
+def answer(publisher: Bus) -> None:
+    """Let a publisher answer the request for replay that is on its way: `_take` gives None once it has."""
+    while publisher._take(time.monotonic() + PATIENCE) is not None:
+        pass
+
+
+def drain(bus: Bus) -> None:
+    """Take all words, among them the tokens of the barrier, until one of them raises."""
+    while bus.receive(timeout=PATIENCE) is not None:
+        pass
+
+
+def steps_of(samples: list[Sample]) -> list[int]:
+    return [Mode.decode(sample.payload).step for sample in samples]
+
+
+def test_what_was_published_before_anybody_listened_is_replayed(coordinator: Bus, recorder: Bus) -> None:
+    """A publisher keeps what nobody has acknowledged: bytes, number, sender and topic."""
+    publish(coordinator, range(5))
+    recorder.request_replay(COORDINATOR, first=2)
+    answer(coordinator)
+    samples = list(recorder.replayed([COORDINATOR]))
+    assert steps_of(samples) == [2, 3, 4]
+    assert [sample.topic for sample in samples] == [MODE] * 3
+    assert [(s.stamp.number, s.stamp.sender) for s in samples if s.stamp is not None] == [
+        (number, COORDINATOR) for number in (2, 3, 4)
+    ]
+
+
+def test_what_was_acknowledged_is_forgotten(coordinator: Bus, recorder: Bus) -> None:
+    """A publisher keeps no more than what the recorder lacks: memory stays flat however long a run is."""
+    for first in range(0, 2000, 100):
+        publish(coordinator, range(first, first + 100))
+        recorder.acknowledge(acknowledged(first + 90))
+        while not isinstance(coordinator.receive(timeout=PATIENCE), Acknowledged):
+            pass
+        assert len(coordinator._kept) == 10
+    recorder.request_replay(COORDINATOR, first=0)
+    answer(coordinator)
+    assert steps_of(list(recorder.replayed([COORDINATOR]))) == list(range(1990, 2000))
+
+
+def test_a_channel_holds_messages_in_order(coordinator: Bus) -> None:
+    """Live messages wait in their channel until they are asked for, none is lost after the barrier."""
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), run="test", who=PLANT) as plant:
+        channel = plant.channel(MODE)
+        plant.enter()
+        list(coordinator.meet([PLANT]))
+        publish(coordinator, range(500))
+        assert steps_of([channel.next() for _ in range(500)]) == list(range(500))
+        assert list(channel.waiting()) == []
+
+
+def test_order_ends_the_run(coordinator: Bus, recorder: Bus) -> None:
+    """An order of the coordinator to stop raises RunClosed with its reason."""
+    coordinator.order(Control(order="stop", steps=1, seed=0, window=1, external=[], reason="enough"))
+    with pytest.raises(RunClosed) as caught:
+        drain(recorder)
+    assert caught.value.control.reason == "enough"
+
+
+def test_a_peer_that_leaves_is_seen(coordinator: Bus) -> None:
+    """Whoever closes its session is gone for the others at once."""
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), run="test", who=PLANT) as plant:
+        plant.enter()
+        list(coordinator.meet([PLANT]))
+    while (word := coordinator.receive(timeout=PATIENCE)) != Peer(PLANT, present=False):
+        assert word is not None
+
+
+def test_signals_are_heeded_until_we_leave(coordinator: Bus, recorder: Bus) -> None:
+    """A signal interrupts whoever is running, and does not cut the closing short."""
+    signal.raise_signal(signal.SIGTERM)
+    with pytest.raises(Interrupted) as caught:
+        drain(recorder)
+    assert caught.value.exit_code == 143
+    recorder.acknowledge(acknowledged(0, closed=True))
+    signal.raise_signal(signal.SIGINT)
+    last_word = coordinator.wait_for_close()
+    assert last_word is not None
+    assert last_word.closed
+
+
+def test_handlers_are_given_back() -> None:
+    """Whoever had the signals before has them again afterwards."""
+    before = signal.getsignal(signal.SIGINT)
+    with Bus(Network(), run="test", who=COORDINATOR):
+        assert signal.getsignal(signal.SIGINT) != before
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_who_is_missing_is_named(coordinator: Bus) -> None:
+    """The barrier gives up at its deadline and names who has not come."""
+    impatient = Network(connect=(coordinator.locators()[0],), wait=0.3)
+    with Bus(impatient, run="test", who=PLANT) as plant:
+        plant.enter()
+        started = time.monotonic()
+        with pytest.raises(RunBroken, match=r'^node "1" and the recorder did not join the run within 0\.3 s$'):
+            list(plant.meet([COORDINATOR, RECORDER, "node-1"]))
+        assert time.monotonic() - started >= 0.3
+
+
+def test_runs_do_not_hear_each_other(coordinator: Bus) -> None:
+    """A peer of another run's name is not there, even on the same network."""
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=0.3), run="other", who=PLANT) as plant:
+        plant.enter()
+        with pytest.raises(RunBroken):
+            list(plant.meet([COORDINATOR]))
+
+
+@pytest.mark.parametrize("question", ["", "?from=x", "?from=0", "?from=-1;_anyke"])
+def test_a_question_that_is_not_the_recorders_is_ignored(coordinator: Bus, recorder: Bus, question: str) -> None:
+    """Anybody may look at the keys of a run without ending it."""
+    publish(coordinator, range(3))
+    asked = recorder._session.get(f"peakmesh/test/replay/{COORDINATOR}{question}", timeout=PATIENCE)
+    answer(coordinator)
+    assert list(asked) == []
+
+
+@pytest.mark.parametrize("payload", [b"hello", b"{}", b'{"order": "dance"}'])
+def test_a_foreign_word_of_control_is_one_sentence(coordinator: Bus, recorder: Bus, payload: bytes) -> None:
+    """What peakmesh did not send on a key of control breaks the run with a sentence, not with a traceback."""
+    coordinator._session.put("peakmesh/test/control", payload)
+    with pytest.raises(RunBroken, match="what came on control is not from peakmesh: "):
+        drain(recorder)
+
+
+def test_a_name_that_is_there_twice_is_refused(coordinator: Bus) -> None:
+    """Two participants of one name would publish the same topic; the coordinator refuses the second."""
+    network = Network(connect=(coordinator.locators()[0],), wait=PATIENCE)
+    with Bus(network, run="test", who=PLANT) as first, Bus(network, run="test", who=PLANT) as second:
+        for bus in (first, second):
+            bus.enter()
+            list(bus.meet([COORDINATOR]))
+            bus.report_ready("gains")
+        with pytest.raises(InputError, match="the plant takes part twice; start it once"):
+            coordinator.gather([PLANT, RECORDER])

@@ -1,0 +1,235 @@
+"""The program's commands: what they print, what they write, how they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from made_recordings import record, simulate
+from places import ROOT
+
+from agent.contract.gains import Gains
+from designer.cli import main
+from designer.problems import names
+from designer.search import effort
+from designer.synthesis import EXACT, METHODS
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, which is also where the commands run."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# Good input.
+def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A design can be verified and shown, and says the same facts as text and as JSON."""
+    assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
+    designed = json.loads(capsys.readouterr().out)
+    assert designed["method"] == "exact"  # the default for a problem this small
+    promised = {"problem", "method", "gamma", "lmi_gamma", "exact", "floor", "holds", "seconds", "output"}
+    assert promised <= designed.keys()
+    assert designed["holds"] is True
+    assert "total" in designed["seconds"]
+    assert run("verify", "gains.json", "--json") == 0
+    verified = json.loads(capsys.readouterr().out)
+    assert {"holds", "gamma", "arithmetic", "failure"} <= verified.keys()
+    assert (verified["holds"], verified["gamma"]) == (True, designed["gamma"])
+    assert run("show", "gains.json") == 0
+    assert f"{designed['gamma']:.5f}"[:6] in capsys.readouterr().out
+    assert run("design", "two-nodes", "-o", "gains.json") == 2
+    assert "exists already" in capsys.readouterr().err
+    assert run("design", "two-nodes", "-o", "gains.json", "--force", "--method", "decomposed") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("two-nodes by decomposed: gamma = 1.41421")
+    assert "ladder     1.414214  floor\n" in printed
+
+
+def test_the_default_of_a_large_problem(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where exact would take too long the decomposed LMI is solved, and one sentence says so."""
+    monkeypatch.setattr(effort, "LONGEST", 0.0)
+    assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["method"] == "decomposed"
+    assert printed.err == "method decomposed: exact would take about 2 seconds here; --method exact asks for it\n"
+
+
+def test_what_if(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A network without a part is designed like any other; the price of every part comes as one table."""
+    assert run("design", "two-nodes", "--without-node", "left", "--method", "decomposed", "--json") == 0
+    designed = json.loads(capsys.readouterr().out)
+    assert (designed["problem"], designed["output"]) == ("two-nodes-without-left", "two-nodes-without-left.gains.json")
+    assert Gains.load(Path(designed["output"])).problem.node_names == ("right",)
+    assert run("design", "two-nodes", "--price", "--method", "decomposed", "--json") == 0
+    printed = capsys.readouterr()
+    table = json.loads(printed.out)
+    assert len(table["rows"]) == 4
+    assert next(row["gamma"] for row in table["rows"] if row["name"] == "left") == pytest.approx(designed["gamma"])
+    assert "   5 of 5 designs" in printed.err
+
+
+def test_show_lists_the_built_in_problems(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a file, show names every built-in problem."""
+    assert run("show") == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in names())
+
+
+def test_a_certificate_that_fails_is_an_answer(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """Verify says no with exit code 1 and why, where a gamma is too small."""
+    assert run("design", "two-nodes", "-o", "gains.json", "--method", "decomposed") == 0
+    document = json.loads(Path("gains.json").read_text())
+    document["certificate"]["gamma"] *= 1 - 1e-5
+    Path("gains.json").write_text(json.dumps(document))
+    capsys.readouterr()
+    assert run("verify", "gains.json") == 1
+    assert "does not hold: " in capsys.readouterr().out
+
+
+def test_a_senseless_certificate_is_refused(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """One sentence names the file, the place and what would be right; a horizon without end is not begun."""
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    text = Path("gains.json").read_text()
+    for edit, sentence in {
+        ("gamma", 1e300): "edited.json: certificate: gamma: must be less than 1e+150, got 1e+300",
+        ("gamma", 1e-300): "edited.json: certificate: gamma: must be greater than 1e-150, got 1e-300",
+        ("horizon", 10**9): "edited.json: certificate: horizon is 1000000000; ",
+        ("horizon", None): "edited.json: certificate: horizon is None; ",
+        ("P", None): 'edited.json: certificate: P of mode "linked" is missing; it must be ',
+    }.items():
+        document = json.loads(text)
+        document["certificate"][edit[0]] = edit[1]
+        Path("edited.json").write_text(json.dumps(document))
+        capsys.readouterr()
+        assert run("verify", "edited.json") == 2
+        assert capsys.readouterr().err.startswith(f"peakmesh: {sentence}")
+
+
+def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """Report writes both pictures as SVG and PNG, and does not replace them unasked."""
+    record(Path("run.mcap"), gains, simulate(gains, steps=30), steps=30)
+    assert run("report", "run.mcap", "--json") == 0
+    pictures = [Path(name) for name in json.loads(capsys.readouterr().out)["pictures"]]
+    assert sorted(path.suffix for path in pictures) == [".png", ".png", ".svg", ".svg"]
+    assert all(path.stat().st_size > 1000 for path in pictures)
+    assert run("report", "run.mcap") == 2
+
+
+# Bad input: every command that reads a file, with every wrong file.
+WRONG_FILES = {
+    "missing": None,
+    "empty": b"",
+    "text": b"hello\n",
+    "binary": bytes(range(256)),
+    "foreign.json": b'{"format": "something else"}',
+    "truncated.json": b'{"format": "peakmesh-gains", "version": 1, "prob',
+    "foreign.toml": b"[tool]\nname = 'x'\n",
+    "truncated.toml": b"name = 'x'\n[plant]\nA = [[0.5",
+    "truncated.mcap": b"\x89MCAP0\r\n\x01",
+}
+COMMANDS = {
+    "design": ["design", "FILE", "-o", "out"],
+    "demo": ["demo", "FILE", "-o", "out"],
+    "analyse": ["analyse", "two-nodes", "--gains", "FILE"],
+    "verify": ["verify", "FILE"],
+    "run": ["run", "FILE", "-o", "out"],
+    "node": ["node", "FILE", "--node", "1", "--connect", "tcp/127.0.0.1:1"],
+    "plant": ["plant", "FILE", "--connect", "tcp/127.0.0.1:1"],
+    "coordinator": ["coordinator", "FILE"],
+    "recorder": ["recorder", "FILE", "-o", "out", "--connect", "tcp/127.0.0.1:1"],
+    "replay": ["replay", "FILE"],
+    "report": ["report", "FILE", "-o", "out"],
+    "show": ["show", "FILE"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("wrong", WRONG_FILES)
+def test_wrong_file(folder: Path, capsys: pytest.CaptureFixture[str], command: str, wrong: str) -> None:
+    """A file that is not what the command reads: exit 2, one sentence that names it, nothing written."""
+    content = WRONG_FILES[wrong]
+    if content is not None:
+        (folder / wrong).write_bytes(content)
+    there = sorted(folder.iterdir())
+    assert run(*(wrong if word == "FILE" else word for word in COMMANDS[command])) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("peakmesh: ")
+    assert printed.err.count("\n") == 1
+    assert wrong in printed.err
+    assert sorted(folder.iterdir()) == there
+
+
+@pytest.mark.parametrize("command", ["analyse", "verify", "run", "node", "plant", "coordinator", "recorder", "show"])
+def test_edited_problem(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    """Gains whose problem was edited afterwards are refused by every command that reads them."""
+    document = json.loads(gains.canonical())
+    document["problem"]["node"][0]["arrival_probability"] = 0.123
+    Path("gains.json").write_text(json.dumps(document))
+    assert run(*("gains.json" if word == "FILE" else word for word in COMMANDS[command])) == 2
+    assert "the problem was edited afterwards; design the gains again" in capsys.readouterr().err
+
+
+def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
+    """Unknown commands, methods and senseless numbers: exit 2."""
+    assert run() == 2
+    assert "COMMAND" in capsys.readouterr().err
+    for words in (["dance"], ["run", "two-nodes", "--steps", "0"], ["run", "two-nodes", "--seed", "-1"]):
+        with pytest.raises(SystemExit) as caught:
+            run(*words)
+        assert caught.value.code == 2
+    for words in (["--steps", "x"], ["--steps", "1.5"], ["--seed", "1e3"], ["--deadline", "soon"]):
+        with pytest.raises(SystemExit):
+            run("run", "two-nodes", *words)
+        assert f"{words[1]} is not a" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run("design", "--help")
+    helped = capsys.readouterr().out
+    assert all(f"{method} " in helped or f"{method}:" in helped for method in (*METHODS, EXACT))
+    assert run("design", "two-nodes", "--method", "magic", "-o", "never.json") == 2
+    assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
+    assert not Path("never.json").exists()
+    for words, sentence in {
+        ("--dask", "tcp://127.0.0.1:1"): "--dask spreads the many designs of --price",
+        ("--price", "--dask", "tcp://127.0.0.1:1"): "no Dask scheduler answers at tcp://127.0.0.1:1: ",
+        ("--price", "-o", "never.json"): "--price writes no gains file",
+        ("--without-link", "left"): "--without-link left: a link is A:B",
+        ("--without-link", "left:left"): "a node always hears itself",
+        ("--without-link", "left:middle"): 'node "middle" does not exist',
+        ("--without-node", "middle"): 'node "middle" does not exist',
+        ("--without-node", "left", "--without-node", "right"): "is the only node of two-nodes-without-left",
+    }.items():
+        assert run("design", "two-nodes", *words) == 2
+        assert sentence in (said := capsys.readouterr().err)
+        assert "designs, whole network" not in said
+
+
+# The whole job, and what is kept of an old one.
+@pytest.mark.timeout(180)
+def test_demo(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One command designs, runs, replays and pictures the paper's second example; every file it names is there."""
+    assert run("demo", "--steps", "50", "--json", "--method", "decomposed") == 0
+    done = json.loads(capsys.readouterr().out)
+    assert 0.34797 < done["design"]["gamma"] < 0.34801
+    assert done["design"]["ladder"]["exact"][1] < done["design"]["gamma"]
+    assert done["replay"]["agrees"]
+    assert done["replay"]["finished"]
+    files = [done["design"]["output"], done["run"]["recording"], *done["pictures"]]
+    assert len(files) == 6
+    assert all(Path(file).is_file() for file in files)
+
+
+def test_golden_recording(capsys: pytest.CaptureFixture[str]) -> None:
+    """A recording of an earlier day still reads, and still agrees with the mathematics."""
+    assert run("replay", ROOT / "recordings" / "golden" / "zhu2020-lossy.mcap", "--json") == 0
+    verdict = json.loads(capsys.readouterr().out)
+    assert (verdict["agrees"], verdict["finished"], verdict["steps"], verdict["missing"]) == (True, True, 60, 0)
+    assert run("verify", ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json") == 0

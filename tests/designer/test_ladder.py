@@ -1,0 +1,99 @@
+"""The ladder, and the choice of the default method."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from itertools import pairwise
+
+import pytest
+
+from agent.contract.problem import Problem
+from benchmarks.design import banded
+from designer.ladder import Ladder, ladder_of, percent, rounded_up
+from designer.problems import find, names
+from designer.search.effort import LONGEST, default_method, in_words, seconds_of_exact
+from designer.synthesis import design
+
+
+def test_the_distances() -> None:
+    """Of the exact gain, below Theorem 2's bound and above the floor."""
+    ladder = Ladder(floor=2.0, exact=(2.19, 2.2), gamma=2.2, theorem2_exact=(3.0, 3.1), theorem2=4.0)
+    assert (ladder.against_theorem2, ladder.above_floor) == (2.2 / 4.0 - 1.0, 2.2 / 2.0 - 1.0)
+    assert ladder.lines() == [
+        "2.000000  floor",
+        "2.200000  exact gain of these gains: -45.0 % against Theorem 2's bound, 10.0 % above the floor",
+        "2.200000  gamma, certified",
+        "3.100000  exact gain of Theorem 2's gains",
+        "4.000000  Theorem 2's bound",
+    ]
+
+
+def test_what_is_not_there_is_not_said() -> None:
+    """No percentage above a floor of zero, and no rung that was not computed."""
+    assert Ladder(0.0, None, 1.0, None, None).lines() == [
+        "0.000000  floor",
+        "1.000000  gamma, certified",
+        "-         exact gain of these gains: not computed for so large a network; analyse does",
+    ]
+    assert Ladder(0.5, None, 1.0, None, 1.0).lines()[1] == "1.000000  gamma, certified: 100.0 % above the floor"
+    assert Ladder(None, (0.9, 1.0), None, None, None).lines() == ["1.000000  exact gain of these gains"]
+    assert Ladder(1e-12, (0.9, 1.0), None, None, None).above_floor is None
+
+
+def test_numbers_of_different_length_stand_in_one_column() -> None:
+    assert Ladder(0.0, (1.7e-4, 1.79884e-4), 1.8e-4, None, 0.2).lines()[1:] == [
+        "0.0001799  exact gain of these gains: -99.9 % against Theorem 2's bound",
+        "0.0001800  gamma, certified",
+        "0.200000   Theorem 2's bound",
+    ]
+
+
+def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
+    """The name of the LMI stands on every line that speaks of it."""
+    lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI").lines()
+    assert lines[1:] == [
+        "1.000000  exact gain of these gains: -75.0 % against the LMI's bound",
+        "1.000000  gamma, certified",
+        "2.000000  exact gain of the LMI's gains",
+        "4.000000  the LMI's bound",
+    ]
+    document = find("two-nodes").document()
+    gains = design(Problem.from_document(document | {"unbiased": True}), method="decomposed")
+    assert (ladder_of(gains).lmi, ladder_of(gains).theorem2) == ("the LMI", gains.certificate.lmi_gamma)
+    assert ladder_of(design(find("two-nodes"), method="decomposed")).lmi == "Theorem 2"
+
+
+@pytest.mark.parametrize(
+    "bound", [0.34799211731349844, 1.0, 2.2, 0.1 + 0.2, 1.1e-9, 9.9999999e-4, 5e-324, 123456.7, 1e300]
+)
+def test_a_bound_is_never_rounded_down(bound: float) -> None:
+    """What is shown is not below it, by six decimals and four digits, whichever is more; its own decimals stay."""
+    shown = rounded_up(bound)
+    assert 0 <= Decimal(shown) - Decimal(str(bound)) < max(Decimal(str(bound)) / 10**3, Decimal(shown) / 10**9)
+    assert len(shown.partition(".")[2]) >= 6
+
+
+def test_bounds_are_shown_as_they_are_read() -> None:
+    assert [rounded_up(bound) for bound in (2.2, 0.3479921, 1.1e-9)] == ["2.200000", "0.347993", "0.000000001100"]
+
+
+def test_percentages() -> None:
+    assert [percent(part) for part in (-0.2954, 0.031, 1e-9, -1e-9)] == ["-29.5 %", "+3.1 %", "0.0 %", "0.0 %"]
+
+
+def test_the_default_is_exact_up_to_ten_minutes() -> None:
+    """Every built-in problem is small; a hundred nodes are not; many designs of one problem are not either."""
+    assert {name: default_method(find(name)) for name in names()} == dict.fromkeys(names(), "exact")
+    large = banded(100)
+    assert seconds_of_exact(large) > LONGEST
+    assert default_method(large) == "decomposed"
+    assert default_method(find("zhu2020-lossy"), designs=1000.0) == "decomposed"
+
+
+def test_the_estimate_grows_with_the_network() -> None:
+    seconds = [seconds_of_exact(banded(n)) for n in (4, 8, 16, 32)]
+    assert all(3.0 < later / earlier < 8.0 for earlier, later in pairwise(seconds))
+
+
+def test_seconds_in_words() -> None:
+    assert [in_words(s) for s in (0.1, 40.0, 700.0, 7300.0)] == ["2 seconds", "40 seconds", "12 minutes", "2 hours"]

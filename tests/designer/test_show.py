@@ -1,0 +1,126 @@
+"""`show` says what a file is, or in one sentence why it is nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from made_recordings import random_gains, random_problem, real_problem, record, simulate
+from places import ROOT
+
+from agent.contract.errors import InputError
+from agent.contract.gains import Gains
+from designer import show
+
+GAINS = random_gains(random_problem(3))
+STEPS = 12
+GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.mcap"
+
+
+def test_a_built_in_problem_is_described_by_name_and_by_path() -> None:
+    facts = show.describe("zhu2020-lossy")
+    assert facts["kind"] == "problem"
+    assert facts["nodes"] == ["1", "2", "3", "4"]
+    assert facts["arrival_probability"] == [0.79, 0.85, 0.78, 0.92]
+    assert (facts["states"], len(facts["modes"]), len(facts["digest"])) == (2, 4, 64)
+    by_path = show.describe(show.PROBLEMS / "zhu2020-lossy.toml")
+    assert by_path.pop("file").endswith("zhu2020-lossy.toml")
+    assert by_path == facts
+
+
+def test_what_real_networks_have_is_described(tmp_path: Path) -> None:
+    problem = real_problem(1, ny=(1, 1, 1), modes=1)
+    assert [(link.receiver, link.sender) for link in problem.links or ()] == [("n1", "n2")]
+    facts = show._problem(problem)
+    assert facts["sees_its_losses"] == ["n1", "n2"]
+    assert facts["lossy_links"] == {"n2 to n1": 0.6}
+    assert facts["unbiased"] is True
+    text = show.text(facts)
+    assert re.search("sees its losses +n1, n2\n", text)
+    assert re.search("lossy links +n2 to n1: 0.6\n", text)
+    assert re.search("unbiased +yes\n", text)
+    plain = show.text(show.describe("zhu2020-lossy"))
+    assert re.search("sees its losses +-\nlossy links +-\nunbiased +no\n", plain)
+
+
+def test_without_a_file_the_built_in_problems_are_listed() -> None:
+    facts = show.describe()
+    assert facts["problems"]["zhu2020-ideal"] == "4 nodes, 2 states, 4 modes"
+    assert "zhu2020-lossy      4 nodes" in show.text(facts)
+
+
+def test_gains_are_described(tmp_path: Path) -> None:
+    path = tmp_path / "gains.json"
+    GAINS.save(path)
+    facts = show.describe(str(path))
+    assert (facts["kind"], facts["method"], facts["gamma"], facts["holds"]) == ("gains", "random", 1.0, False)
+    assert facts["digest"] == GAINS.digest()
+    text = show.text(facts)
+    assert "none 0: none, 0 iterations" in text
+    assert re.search("gamma +not claimed", text)
+
+
+def test_what_gains_claim_is_shown_as_a_claim(tmp_path: Path) -> None:
+    """Nothing but `verify` can say that it holds: the file may have been edited since."""
+    document = Gains.load(GOLDEN.with_suffix(".gains.json")).document()
+    document["certificate"] |= {"exact": None, "floor": None}
+    path = tmp_path / "gains.json"
+    Gains.model_validate(document).save(path)
+    facts = show.describe(path)
+    assert (facts["holds"], facts["exact"]) == (True, None)
+    text = show.text(facts)
+    assert re.search(r'gamma +claimed 0\.3479921\d+, by design; "peakmesh verify" checks it', text)
+    assert not re.search("^(holds|verified|exact|floor)", text, re.MULTILINE)
+    document["certificate"] |= {"exact": [0.25, 0.5], "floor": 0.125, "lmi_gamma": 0.75}
+    Gains.model_validate(document).save(path, force=True)
+    text = show.text(show.describe(path))
+    assert re.search("exact +claimed between 0.25 and 0.5", text)
+    assert re.search("floor +claimed 0.125", text)
+    assert re.search("lmi gamma +claimed 0.75", text)
+    assert re.search(r'claimed 0\.3479921\d+, by design; "peakmesh replay" checks it', show.text(show.describe(GOLDEN)))
+
+
+def test_a_recording_is_described(tmp_path: Path) -> None:
+    sent = simulate(GAINS, steps=STEPS)
+    facts = show.describe(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS))
+    assert facts["kind"] == "recording"
+    assert facts["messages"] == Counter(message.topic for message in sent)
+    assert (facts["run"], facts["seed"], facts["steps"], facts["status"]) == ("test", "1", "12", "finished")
+    assert facts["damage"] == ""
+    assert f"node/*/estimate: {4 * STEPS}" in show.text(facts)
+    json.dumps(facts, allow_nan=False)
+
+
+def test_a_cut_recording_says_so(tmp_path: Path) -> None:
+    sent = simulate(GAINS, steps=STEPS)
+    facts = show.describe(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS, whole=False))
+    assert facts["status"] == "cut: it has no end"
+    assert facts["complete_steps"] is None
+    assert "cut or damaged" in facts["damage"]
+
+
+def test_what_is_none_of_these_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    gains = GAINS.canonical()
+    recording = record(tmp_path / "run.mcap", GAINS, simulate(GAINS, steps=STEPS), steps=STEPS).read_bytes()
+    for name, data, why in (
+        ("photo.png", b"\x89PNG\r\n\x1a\n", "is neither a problem"),
+        ("empty", b"", "is neither a problem"),
+        ("cut.json", gains[: len(gains) // 2], "is not valid JSON"),
+        ("other.json", b'{"format": "other"}', "is not a gains file"),
+        ("cut.mcap", recording[:300], "cut or damaged before its first message"),
+        ("bad.toml", b"name = ", "is not valid TOML"),
+        ("other.toml", b'name = "x"\n[tool]\na = 1\n', "this key is not known here"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=why) as raised:
+            show.describe(path)
+        assert str(path) in str(raised.value)
+        assert "\n" not in str(raised.value)
+    with pytest.raises(InputError, match=r'does not exist, nor is it a built-in problem; these are .*"zhu2020-lossy"'):
+        show.describe(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="could not be read"):
+        show.describe(tmp_path)
