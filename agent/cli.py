@@ -115,7 +115,7 @@ def run_command(options: argparse.Namespace) -> int:
 
 def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str, Any]:
     """Run the gains in `path` on this machine; returns the facts of the run."""
-    from agent.contract.recording import refuse_recording
+    from agent.contract.recording.writer import refuse_recording
     from agent.launch import launch
 
     plan = _plan(options, gains)

@@ -26,7 +26,7 @@ import unix_sockets
 
 from agent.contract.gains import Gains
 from agent.contract.messages import estimate
-from agent.contract.recording import RecordingReader
+from agent.contract.recording.reader import RecordingReader
 
 GOLDEN = Path(__file__).parents[1] / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 SEED = 1

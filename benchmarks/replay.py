@@ -22,7 +22,8 @@ from agent import filter as node
 from agent.contract import messages, schedule
 from agent.contract.gains import Certificate, Gains, Solver
 from agent.contract.problem import Problem
-from agent.contract.recording import Logged, RecordingWriter
+from agent.contract.recording import Logged
+from agent.contract.recording.writer import RecordingWriter
 from agent.roles.plant import SimulatedPlant
 
 CHILD = """

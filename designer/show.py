@@ -10,7 +10,7 @@ from agent.contract.errors import InputError, counted, listed
 from agent.contract.files import read_bytes
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from agent.contract.recording import RecordingReader
+from agent.contract.recording.reader import RecordingReader
 
 MCAP_MAGIC = b"\x89MCAP"
 PROBLEMS = Path(__file__).parent / "problems"

@@ -23,7 +23,8 @@ from agent.contract.messages import (
     measurement,
     node_who,
 )
-from agent.contract.recording import Logged, RecordingWriter, refuse_recording
+from agent.contract.recording import Logged
+from agent.contract.recording.writer import RecordingWriter, refuse_recording
 from agent.network.bus import Bus, Channel, RunClosed, Sample
 from agent.receipts import Ledger
 from agent.roles.joining import join

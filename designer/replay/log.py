@@ -18,7 +18,8 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.messages import EVENT, MODE, PLANT_STATE, Event, estimate, measurement
-from agent.contract.recording import Logged, RecordingReader
+from agent.contract.recording import Logged
+from agent.contract.recording.reader import RecordingReader
 from designer.replay.census import Census, take_census
 from designer.replay.topics import Numbers, Senders, Topic, Words, topics_of
 

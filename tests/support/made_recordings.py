@@ -16,7 +16,8 @@ from agent.contract import messages, schedule
 from agent.contract.files import canonical
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from agent.contract.recording import Logged, RecordingWriter
+from agent.contract.recording import Logged
+from agent.contract.recording.writer import RecordingWriter
 
 
 class Sent(NamedTuple):

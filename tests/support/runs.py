@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from agent.contract.messages import Message, model_of
-from agent.contract.recording import Logged, RecordingReader
+from agent.contract.recording import Logged
+from agent.contract.recording.reader import RecordingReader
 
 PATIENCE = 60.0  # seconds after which a wait of a test has failed
 

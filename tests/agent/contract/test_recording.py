@@ -14,11 +14,13 @@ from made_recordings import random_gains, random_problem, record, simulate
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from agent.contract import recording
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.files import canonical
 from agent.contract.gains import Gains
-from agent.contract.recording import FLUSH_SECONDS, Logged, RecordingReader, RecordingWriter
+from agent.contract.recording import Logged
+from agent.contract.recording import writer as recording
+from agent.contract.recording.reader import RecordingReader
+from agent.contract.recording.writer import FLUSH_SECONDS, RecordingWriter
 
 GAINS = random_gains(random_problem(1, ny=(1,), modes=1))
 MESSAGES = [
