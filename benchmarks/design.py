@@ -36,7 +36,7 @@ CHILD = """
 import json, resource, sys, time
 from agent.contract.gains import Gains
 from benchmarks.design import network
-from designer.proof.theorem1 import verify
+from designer.proof.certificate import verify
 from designer.synthesis import design
 problem = network(sys.argv[2], seed=int(sys.argv[3]))
 started, cpu = time.perf_counter(), time.process_time()

@@ -1,14 +1,10 @@
 """The mathematics of peakmesh, seen centrally: design, verification, replay, pictures.
 
-the model       error_model; units: natural ones
-any gains       gain: their exact gain; sensitivity: its derivative; worst_case: the disturbances that attain it;
-                floor: below which no gains get; analysis: all of that for somebody else's gains; ladder: its lines
-the search      descent, along the barrier, by bfgs, from consensus gains; exact_design: from problem to gains that way
-the LMI         lmi: Theorem 2, and node by node; inwards, back_off: from its solution to a P that can be proved
-the design      synthesis: one method or another; effort: which by default; diagnosis: why there is no solution
-the proof       certificate, exact_certificate, of ball_model, in balls
-what if         what_if: without a node or a link; workers: many designs or runs at once
-runs            simulation: thousands; replay: one recording; figures: its pictures; show: what a file is
-the paper       reproduce: its table; problems: its examples, and others
-the program     cli, commands
+the rooms       model: eqs. (6)-(11); gain: what gains really guarantee; lmi: Theorem 2, and gains by it;
+                search: gains of least exact gain; proof: certificates, without a solver; replay: one recording, judged;
+                report: its pictures; problems: the paper's examples, and others; commands: what the program does
+the design      synthesis: one method or another; diagnosis: why there is no solution; ladder: what a design is worth
+other answers   analysis: somebody else's gains; what_if: without a node or a link; reproduce: the paper's table;
+                simulation: thousands of runs; show: what a file is
+the machine     workers: many designs or runs at once; cli: the program
 """

@@ -1,11 +1,11 @@
 """Why a problem has no solution, and what in it is close to having none; in sentences that name the part.
 
 A stable plant always has a solution: the network that ignores everything (designer.lmi.inwards). Only an unstable
-plant, which is admissible where gains are unbiased and every loss is seen, has obstacles. Let A v = lambda v, |lambda| >= 1,
-and let a set S of nodes be such that, in one step of any mode, with probability q at least, no message from outside S
-reaches S and no measurement of S with C_j v != 0 arrives. Start every node of S with the error v. As long as that goes
-on, the innovations of S are 0, the differences between its estimates are 0, and every error is lambda^k v. So
-E|e_i(k)|^2 >= (q |lambda|^2)^k |v|^2, whatever the gains: q |lambda|^2 < 1 is necessary for mean-square stability.
+plant, which is admissible where gains are unbiased and every loss is seen, has obstacles. Let A v = lambda v, |lambda|
+>= 1, and let a set S of nodes be such that, in one step of any mode, with probability q at least, no message from
+outside S reaches S and no measurement of S with C_j v != 0 arrives. Start every node of S with the error v. As long as
+that goes on, the innovations of S are 0, the differences between its estimates are 0, and every error is lambda^k v.
+So E|e_i(k)|^2 >= (q |lambda|^2)^k |v|^2, whatever the gains: q |lambda|^2 < 1 is necessary for mean-square stability.
 q = 1 is a node that is blind for ever. It has to hold in every class of modes that is never left, since gamma is for
 any initial mode. That it does not hold is proved here without a solver; where it holds, and no design was found all
 the same, parts of the problem are relaxed in turn to see which of them is in the way. docs/theory.md, section 10.

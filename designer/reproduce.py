@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.ladder import rounded_up
-from designer.model.error_model import StackedGains
+from designer.model.error_model import StackedGains, error_model
 from designer.problems import find
-from designer.search.exact_design import exact_bounds
 from designer.search.starts import consensus_gains, least_variance_gains
 
 PRINTED = {"zhu2020-ideal": 0.23, "zhu2020-lossy": 0.36}  # gamma of examples 1 and 2
@@ -56,7 +56,7 @@ class Computed:
         return self._exact_of(least_variance_gains(self.problem))
 
     def _exact_of(self, gains: StackedGains) -> float | None:
-        bounds = exact_bounds(self.problem, *gains)
+        bounds = exact_gain(error_model(self.problem, *gains)).bounds
         return None if bounds is None else bounds[1]
 
     def _designed(self, method: str) -> Gains:

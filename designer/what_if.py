@@ -21,7 +21,7 @@ from designer.gain.exact import exact_gain
 from designer.ladder import percent, rounded_up
 from designer.lmi.back_off import least_gamma
 from designer.model.error_model import StackedGains, error_model, stacked_gains, stacked_links
-from designer.proof.theorem1 import lyapunov_matrix
+from designer.proof.certificate import lyapunov_matrix
 from designer.search.effort import default_method
 from designer.workers import each, greet_cluster
 

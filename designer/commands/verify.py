@@ -25,7 +25,7 @@ def add_verify(commands: agent.cli.Subcommands) -> None:
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS`."""
-    from designer.proof.theorem1 import verify
+    from designer.proof.certificate import verify
 
     gains = agent.cli.load_gains(options.gains)
     started = time.perf_counter()

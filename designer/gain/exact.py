@@ -44,6 +44,11 @@ class Gain(NamedTuple):
         """Whether the error system is mean-square stable."""
         return math.isfinite(self.high)
 
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """The interval that the exact gain lies in; None where the errors are not mean-square stable."""
+        return (self.low, self.high) if self.stable else None
+
 
 class Operator:
     """The matrices of (10)(11) in the shapes that the recursions multiply by."""

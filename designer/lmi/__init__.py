@@ -10,7 +10,7 @@ from agent.contract.problem import Problem
 
 
 class LmiSolution(NamedTuple):
-    """What a solver says of a design LMI. It is believed only after designer.proof.theorem1 has checked it."""
+    """What a solver says of a design LMI. It is believed only after designer.proof has checked it."""
 
     gamma: float  # sqrt(delta) of (42)
     R: Array  # (nx, nx), over the state x of the plant; (0, 0) where the errors do not depend on x

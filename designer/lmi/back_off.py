@@ -22,7 +22,8 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel, error_model, stacked_links
-from designer.proof.theorem1 import Verdict, check
+from designer.proof.findings import Verdict
+from designer.proof.theorem1 import check
 
 Form = Literal["structured", "full"]
 

@@ -32,7 +32,7 @@ def checked_gamma(gains: Gains) -> Gamma:
     claim = gains.certificate
     if not claim.holds:
         return Gamma(claim.gamma, is_claimed=False, failure="gamma is not claimed")
-    from designer.proof.theorem1 import verify  # it loads ball arithmetic, which nothing else of a replay needs
+    from designer.proof.certificate import verify  # it loads ball arithmetic, which nothing else of a replay needs
 
     try:
         failure = verify(gains).failure

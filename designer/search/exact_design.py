@@ -14,15 +14,16 @@ from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.gain.exact import Gain, exact_gain
 from designer.gain.floor import floor
+from designer.lmi import beyond_paper
+from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
+from designer.proof.findings import Verdict
 from designer.proof.recursion import check_exact
-from designer.proof.theorem1 import Verdict
 from designer.search.descent import Descent, Progress, descend
 from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
 
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
-_LADDER_STATES = 250  # n nx up to which the exact gain of other methods' gains is worth its time
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -44,7 +45,9 @@ def design_exact(
             "the plant that the disturbance drives; measure it"
         )
     starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
-    lmi_exact = next((exact_bounds(problem, *starts[name]) for name in _LMI_STARTS if name in starts), None)
+    lmi_exact = next(
+        (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
+    )
     if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
@@ -83,20 +86,6 @@ def design_exact(
     )
 
 
-def with_ladder(problem: Problem, K: LinkMatrices, H: LinkMatrices, certificate: Certificate) -> Certificate:
-    """The certificate with the exact gain of the gains, unless the network is large, and the floor."""
-    exact = None
-    if problem.n * problem.nx <= _LADDER_STATES:
-        exact = exact_bounds(problem, *stacked_links(problem, K, H))
-    return certificate.model_copy(update={"exact": exact, "floor": floor(problem)})
-
-
-def exact_bounds(problem: Problem, K_bar: Array, H_bar: Array) -> tuple[float, float] | None:
-    """The interval that the exact gain lies in; None where the errors are not mean-square stable."""
-    gain = exact_gain(error_model(problem, K_bar, H_bar))
-    return (gain.low, gain.high) if gain.stable else None
-
-
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
     starts = {
@@ -105,8 +94,7 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     }
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None
-    from designer.lmi import beyond_paper, decomposed, theorem2  # cvxpy takes seconds to import
-    from designer.synthesis import recover
+    from designer.lmi import decomposed, theorem2  # cvxpy takes seconds to import
 
     name = "decomposed" if beyond_paper(problem) else "theorem2"
     try:

@@ -21,7 +21,7 @@ from designer.cli import main
 from designer.gain.exact import exact_gain
 from designer.model.error_model import error_model, link_gains, stacked_gains
 from designer.problems import find
-from designer.proof.theorem1 import verify
+from designer.proof.certificate import verify
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 Document = dict[str, Any]

@@ -13,9 +13,10 @@ from agent.contract.gains import Solver
 from agent.contract.problem import Problem
 from designer import synthesis
 from designer.lmi import LmiSolution
+from designer.lmi.lmi_design import METHODS
 from designer.problems import find
-from designer.proof.theorem1 import verify
-from designer.synthesis import METHODS, design
+from designer.proof.certificate import verify
+from designer.synthesis import design
 
 SOLVER = Solver(name="made up", version="0", status="optimal_inaccurate", iterations=1, seconds=0.0)
 

@@ -11,9 +11,10 @@ from places import ROOT
 
 from agent.contract.gains import Gains
 from designer.cli import main
+from designer.lmi.lmi_design import METHODS
 from designer.problems import names
 from designer.search import effort
-from designer.synthesis import EXACT, METHODS
+from designer.synthesis import EXACT
 
 
 def run(*arguments: object) -> int:

@@ -20,12 +20,14 @@ from designer.lmi import cliques, conic, decomposed, theorem2
 from designer.lmi.back_off import back_off, least_gamma
 from designer.lmi.cones import Assembly
 from designer.lmi.inwards import inwards
+from designer.lmi.recovery import block_diagonal, recover
 from designer.lmi.witness import Witness, witness
 from designer.model.error_model import error_model, link_gains
 from designer.model.units import natural_units
 from designer.problems import find
-from designer.proof.theorem1 import check, verify
-from designer.synthesis import block_diagonal, design, recover
+from designer.proof.certificate import verify
+from designer.proof.theorem1 import check
+from designer.synthesis import design
 
 PAPER = [
     find("zhu2020-ideal"),

@@ -14,10 +14,10 @@ from agent.contract.errors import InputError, Unattainable
 from agent.contract.problem import Problem
 from designer.lmi import theorem2
 from designer.lmi.back_off import inequality_17, plant_lyapunov
+from designer.lmi.recovery import block_diagonal, recover
 from designer.model.error_model import error_model, paper_error_model, stacks
 from designer.model.units import natural_units, rescaled
 from designer.problems import find
-from designer.synthesis import block_diagonal, recover
 
 
 def analysis_optimum(problem: Problem) -> float:

@@ -15,7 +15,7 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.model.error_model import error_model, step
 from designer.problems import find, names
-from designer.proof.theorem1 import verify
+from designer.proof.certificate import verify
 from designer.search.starts import least_variance_gains
 from designer.synthesis import design
 

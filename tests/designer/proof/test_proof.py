@@ -26,12 +26,11 @@ from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
-from designer.proof import balls
-from designer.proof import recursion as exact_certificate
-from designer.proof import theorem1 as certificate
+from designer.proof import balls, findings, recursion, theorem1
 from designer.proof.ball_model import BallModel, Noise, Sensor
 from designer.proof.balls import above, below, exact, floats, sign
-from designer.proof.theorem1 import check, lyapunov_matrix, symmetric, verify
+from designer.proof.certificate import lyapunov_matrix, verify
+from designer.proof.theorem1 import check, symmetric
 from designer.search.starts import consensus_gains
 
 Document = dict[str, Any]
@@ -325,7 +324,7 @@ def test_with_few_bits_nothing_false_is_proved_and_nothing_true_is_proved_false(
     low = gains.certificate.exact[0] * (1.0 - 1e-8)
     false = gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"gamma": low})})
     for bits in (26, 28):
-        monkeypatch.setattr(certificate, "BITS", (bits,))
+        monkeypatch.setattr(findings, "BITS", (bits,))
         assert not verify(false).holds
         assert "it is false" not in str(verify(gains).failure)
 
@@ -342,17 +341,17 @@ def test_the_recursion_and_the_tail_have_as_many_steps_as_the_horizon(horizon: i
     with ctx.workprec(128):
         model = BallModel(gains.problem, gains.K, gains.H)
         for g, proved in ((high * (1.0 + 1e-6), True), (low * (1.0 - 1e-6), False)):
-            found = exact_certificate._recursion(model, modes, arb(g), horizon)
+            found = recursion._recursion(model, modes, arb(g), horizon)
             assert all(finding.sign.proved for finding in found) is proved
             assert found[-1].sign.refuted is not proved
-        powers = np.array([floats(Z) for Z in exact_certificate._powers(model, horizon, above)])
+        powers = np.array([floats(Z) for Z in recursion._powers(model, horizon, above)])
     np.testing.assert_allclose(powers, tail, rtol=0, atol=1e-12 * np.abs(tail).max())
 
 
 def test_a_tail_that_floats_find_too_small_is_proved_false(monkeypatch: pytest.MonkeyPatch) -> None:
     """tau^2 is found by floats; the proof does not rest on it."""
-    found = exact_certificate._relative
-    monkeypatch.setattr(exact_certificate, "_relative", lambda Z, P: 0.99 * found(Z, P))
+    found = recursion._relative
+    monkeypatch.setattr(recursion, "_relative", lambda Z, P: 0.99 * found(Z, P))
     verdict = verify(ALL["real", "exact"])
     assert verdict.failure is not None
     assert verdict.failure.startswith("tail fails")
@@ -480,7 +479,7 @@ def test_the_blocks_of_P_change_nothing(variant: dict[str, Any]) -> None:
     zero = np.zeros((2, problem.n * problem.nx, problem.n * problem.nx))
     model = BallModel(problem, *link_gains(problem, zero + 0.1, random_gains(problem, 7)[1]))
     P = partly_joined(problem)
-    P_balls, found = symmetric(P), certificate._blocks(model, P)
+    P_balls, found = symmetric(P), theorem1._blocks(model, P)
     joined = [block for block in found if model.e[0][0] in block]
     assert joined == [model.e[0] + model.e[1]]
     assert sorted(k for block in found for k in block) == model.eta
@@ -501,7 +500,7 @@ def test_18_sees_what_joins_the_states_of_a_node() -> None:
     zero = np.zeros((1, 4, 4))
     model = BallModel(problem, *link_gains(problem, zero, zero[:, :, :2]))
     for p, proved in ((1.5, False), (2.5, True)):
-        (finding,) = certificate._inequality_18(model, problem.mode_names, p * np.eye(6)[None], 1.0)
+        (finding,) = theorem1._inequality_18(model, problem.mode_names, p * np.eye(6)[None], 1.0)
         assert (finding.sign.proved, finding.sign.refuted) == (proved, not proved)
 
 
@@ -616,14 +615,14 @@ def test_above_and_below_enclose_every_matrix_of_the_ball() -> None:
 def test_too_few_bits_are_doubled(monkeypatch: pytest.MonkeyPatch) -> None:
     """(18) with 1e-9 to spare cannot be told with 20 bits: not proved with those alone, proved with more."""
     gains = ALL["paper", "lyapunov"]
-    monkeypatch.setattr(certificate, "BITS", (20,))
+    monkeypatch.setattr(findings, "BITS", (20,))
     verdict = verify(gains)
     assert not verdict.holds
     assert verdict.failure is not None
     assert "it is not proved" in verdict.failure
     assert "which 20 bits leave open" in verdict.failure
     assert min(verdict.margins.values()) <= 0.0
-    monkeypatch.setattr(certificate, "BITS", (20, 128))
+    monkeypatch.setattr(findings, "BITS", (20, 128))
     verdict = verify(gains)
     assert verdict.holds
     assert "128 bits" in verdict.arithmetic
@@ -739,7 +738,7 @@ def test_verifying_imports_no_solver(kind: Kind, tmp_path: Path) -> None:
     ALL["paper", kind].save(path)
     code = (
         "import sys; from pathlib import Path; from agent.contract.gains import Gains;"
-        "from designer.proof.theorem1 import verify; assert verify(Gains.load(Path(sys.argv[1]))).holds;"
+        "from designer.proof.certificate import verify; assert verify(Gains.load(Path(sys.argv[1]))).holds;"
         "print(sorted({'cvxpy', 'clarabel', 'scs', 'scipy'} & set(sys.modules)))"
     )
     root = ROOT

@@ -17,7 +17,7 @@ from designer.gain.floor import floor
 from designer.model.error_model import error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
 from designer.problems import find
-from designer.proof.theorem1 import verify
+from designer.proof.certificate import verify
 from designer.search import bfgs, descent
 from designer.search.barrier import Barrier, Entries
 from designer.search.descent import Progress, descend
