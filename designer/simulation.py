@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
-from agent.contract.problem import White
+from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
 from designer.model.error_model import measurement_slices, stacked_gains
 from designer.workers import each

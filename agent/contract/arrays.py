@@ -1,4 +1,4 @@
-"""Read-only float64 arrays as fields of pydantic models: nested lists in files, numpy inside."""
+"""What the models of the contract are made of: read-only float64 arrays, nested lists in files, and strict numbers."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, PlainSerializer, PlainValidator
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator
 
 from agent.contract.errors import counted, shortened
 from agent.contract.files import canonical, digest
 
 Array = NDArray[np.float64]
+Number = Annotated[float, Field(strict=True)]  # neither "0.5" nor true is a number
 
 
 class Model(BaseModel):

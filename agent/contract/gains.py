@@ -9,10 +9,10 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from agent.contract.arrays import Array, Matrix, Model, shape_text
+from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
 from agent.contract.errors import InputError, first_fault, listed
 from agent.contract.files import kind_of, read_bytes, write_whole
-from agent.contract.problem import Number, Problem
+from agent.contract.problem import Problem
 
 FORMAT = "peakmesh-gains"
 VERSION = 1

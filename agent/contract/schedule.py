@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
-from agent.contract.problem import DampedSine, Impulse, Problem, Quiet, Samples, White, WorstCase
+from agent.contract.problem import Problem
+from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
 
 MODES, LOSSES, DISTURBANCE, DELIVERIES = 1, 2, 3, 4  # the streams
 _BLOCK = 256  # steps drawn at once; results do not depend on it

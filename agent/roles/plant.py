@@ -9,7 +9,8 @@ from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, PlantState, decode, measurement
-from agent.contract.problem import Node, Problem
+from agent.contract.problem import Problem
+from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.network.bus import Bus
 from agent.roles.joining import take_part

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
-from agent.contract.problem import WorstCase
+from agent.contract.problem.disturbance import WorstCase
 from designer.gain.exact import Operator
 from designer.gain.sensitivity import critical, critical_sweep
 from designer.model.error_model import ErrorModel, error_model, realised, stacked_gains

@@ -32,7 +32,8 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Solver
-from agent.contract.problem import Node, Problem
+from agent.contract.problem import Problem
+from agent.contract.problem.parts import Node
 from designer.lmi import LmiSolution, attempts, conic
 from designer.lmi.attempts import SOLVED, Attempt, first_accurate
 from designer.lmi.cliques import clique_tree

@@ -1,0 +1,120 @@
+"""The parts of a problem, each checked by itself: plant, node, topology, link, Markov chain. Eqs. (1)-(3)."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, field_validator, model_validator
+
+from agent.contract.arrays import Matrix, Model, Number, shape_text
+from agent.contract.errors import counted, shortened
+
+
+def _legal_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
+        raise ValueError(f'{shortened(name)} is not a legal name: use 1 to 64 letters, digits, "-" and "_"')
+    return name
+
+
+Name = Annotated[str, AfterValidator(_legal_name)]
+
+
+class Plant(Model):
+    """Eq. (1): x(k+1) = A x(k) + B w(k), z(k) = M x(k). A: (nx, nx), B: (nx, nw), M: (nz, nx)."""
+
+    A: Matrix
+    B: Matrix
+    M: Matrix
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        nx = self.A.shape[0]
+        if self.A.shape[1] != nx:
+            raise ValueError(f"A is {shape_text(self.A)}; it must be square")
+        if self.B.shape[0] != nx:
+            raise ValueError(f"B is {shape_text(self.B)}; A is {shape_text(self.A)}, so B needs {counted(nx, 'row')}")
+        if self.M.shape[1] != nx:
+            raise ValueError(
+                f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {counted(nx, 'column')}"
+            )
+        return self
+
+    @property
+    def spectral_radius(self) -> float:
+        """Of A: below 1 where the plant is stable."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+
+class Node(Model):
+    """Eq. (2): y_i(k) = theta_i(k) C_i x(k) + D_i w(k). C_i: (ny_i, nx), D_i: (ny_i, nw).
+
+    `arrival_probability` is beta_i = P(theta_i(k) = 1) of eq. (3), in (0, 1]. `loss` says what the node knows of
+    theta_i(k): "hidden", as in the paper, nothing; "seen": a lost measurement does not arrive at all, and the
+    innovation theta_i (C_i x + D_i w - C_i x_hat_i) is then 0. None stands for "hidden".
+    """
+
+    name: Name
+    C: Matrix
+    D: Matrix
+    arrival_probability: Number
+    loss: Literal["hidden", "seen"] | None = None
+
+    @property
+    def seen(self) -> bool:
+        """Whether the node knows which of its measurements are lost."""
+        return self.loss == "seen"
+
+    @field_validator("loss")
+    @classmethod
+    def _one_word(cls, value: str | None) -> str | None:
+        return None if value == "hidden" else value  # so that the digest does not depend on whether it is written
+
+    @field_validator("arrival_probability")
+    @classmethod
+    def _in_range(cls, value: float) -> float:
+        if not 0.0 < value <= 1.0:
+            raise ValueError(f"{value} is not in (0, 1]; 1 means that no measurement is ever lost")
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.C.shape[0] != self.D.shape[0]:
+            raise ValueError(
+                f"C is {shape_text(self.C)} and D is {shape_text(self.D)}; "
+                "both need one row for each measurement of the node"
+            )
+        return self
+
+
+class Topology(Model):
+    """One mode: adjacency (n, n) with a_ij > 0 where node i hears node j, and a_ii > 0."""
+
+    name: Name
+    adjacency: Matrix
+
+
+class LossyLink(Model):
+    """Messages from `sender` reach `receiver` with this probability, independently at every step.
+
+    Where one does not, the receiver puts its own estimate in place of the sender's and 0 in place of its innovation.
+    """
+
+    receiver: str
+    sender: str
+    delivery_probability: Number
+
+    @field_validator("delivery_probability")
+    @classmethod
+    def _in_range(cls, value: float) -> float:
+        if not 0.0 < value <= 1.0:
+            raise ValueError(f"{value} is not in (0, 1]; 1 means that every message arrives")
+        return value
+
+
+class MarkovChain(Model):
+    """The switching of the topology: pi_st = P(r(k+1) = t | r(k) = s); `initial` names r(0)."""
+
+    transition: Matrix
+    initial: str
