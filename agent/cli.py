@@ -30,7 +30,7 @@ from agent.plan import LARGEST_WINDOW
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
-    from agent.network.bus import Network
+    from agent.network.configuration import Network
     from agent.plan import Plan
 
 Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # what add_subparsers returns
@@ -321,7 +321,7 @@ def _plan(options: argparse.Namespace, gains: Gains) -> Plan:
 
 
 def _network(options: argparse.Namespace) -> Network:
-    from agent.network.bus import Network
+    from agent.network.configuration import Network
 
     connect = tuple(options.connect)
     if options.child:

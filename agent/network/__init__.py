@@ -1,1 +1,1 @@
-"""A participant's place on the network: the only folder that imports zenoh."""
+"""A participant's place on the network. Roles talk to `bus`; behind it, `session` alone imports zenoh."""

@@ -25,7 +25,8 @@ from agent.contract.messages import (
     sensor_who,
 )
 from agent.contract.schedule import modes
-from agent.network.bus import Bus, Peer
+from agent.network.bus import Bus
+from agent.network.words import Peer
 from agent.plan import Plan
 
 REPORT_SECONDS = 0.1

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import Control, participants
-from agent.network.bus import Bus, ChannelClosed, RunClosed
+from agent.network.bus import Bus
+from agent.network.words import ChannelClosed, RunClosed
 
 
 def join(bus: Bus, gains: Gains) -> Control:

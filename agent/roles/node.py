@@ -14,7 +14,8 @@ from agent.contract.messages import MODE, Control, Estimate, decode, estimate, m
 from agent.contract.schedule import Deliveries
 from agent.filter import innovation, step
 from agent.inbox import Inbox
-from agent.network.bus import Bus, Sample
+from agent.network.bus import Bus
+from agent.network.words import Sample
 from agent.roles.joining import take_part
 
 

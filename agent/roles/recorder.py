@@ -25,7 +25,9 @@ from agent.contract.messages import (
 )
 from agent.contract.recording import Logged
 from agent.contract.recording.writer import RecordingWriter, refuse_recording
-from agent.network.bus import Bus, Channel, RunClosed, Sample
+from agent.network.bus import Bus
+from agent.network.session import Channel
+from agent.network.words import RunClosed, Sample
 from agent.receipts import Ledger
 from agent.roles.joining import join
 

@@ -9,8 +9,10 @@ from collections.abc import Iterator
 import pytest
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
-from agent.contract.messages import COORDINATOR, MODE, PLANT, RECORDER, Acknowledged, Control, Mode
-from agent.network.bus import Bus, Network, Peer, RunClosed, Sample
+from agent.contract.messages import CONTROL, COORDINATOR, MODE, PLANT, RECORDER, Acknowledged, Control, Mode
+from agent.network.bus import Bus
+from agent.network.configuration import Network
+from agent.network.words import Peer, RunClosed, Sample
 
 PATIENCE = 20.0
 
@@ -51,8 +53,8 @@ def acknowledged(received: int, *, closed: bool = False) -> Acknowledged:
 
 
 def answer(publisher: Bus) -> None:
-    """Let a publisher answer the request for replay that is on its way: `_take` gives None once it has."""
-    while publisher._take(time.monotonic() + PATIENCE) is not None:
+    """Let a publisher answer the request for replay that is on its way: `take` gives None once it has."""
+    while publisher._words.take(time.monotonic() + PATIENCE) is not None:
         pass
 
 
@@ -86,7 +88,7 @@ def test_what_was_acknowledged_is_forgotten(coordinator: Bus, recorder: Bus) -> 
         recorder.acknowledge(acknowledged(first + 90))
         while not isinstance(coordinator.receive(timeout=PATIENCE), Acknowledged):
             pass
-        assert len(coordinator._kept) == 10
+        assert len(coordinator._outbox) == 10
     recorder.request_replay(COORDINATOR, first=0)
     answer(coordinator)
     assert steps_of(list(recorder.replayed([COORDINATOR]))) == list(range(1990, 2000))
@@ -164,7 +166,7 @@ def test_runs_do_not_hear_each_other(coordinator: Bus) -> None:
 def test_a_question_that_is_not_the_recorders_is_ignored(coordinator: Bus, recorder: Bus, question: str) -> None:
     """Anybody may look at the keys of a run without ending it."""
     publish(coordinator, range(3))
-    asked = recorder._session.get(f"peakmesh/test/replay/{COORDINATOR}{question}", timeout=PATIENCE)
+    asked = recorder._session._zenoh.get(f"peakmesh/test/replay/{COORDINATOR}{question}", timeout=PATIENCE)
     answer(coordinator)
     assert list(asked) == []
 
@@ -172,7 +174,7 @@ def test_a_question_that_is_not_the_recorders_is_ignored(coordinator: Bus, recor
 @pytest.mark.parametrize("payload", [b"hello", b"{}", b'{"order": "dance"}'])
 def test_a_foreign_word_of_control_is_one_sentence(coordinator: Bus, recorder: Bus, payload: bytes) -> None:
     """What peakmesh did not send on a key of control breaks the run with a sentence, not with a traceback."""
-    coordinator._session.put("peakmesh/test/control", payload)
+    coordinator._session.say(CONTROL, payload)
     with pytest.raises(RunBroken, match="what came on control is not from peakmesh: "):
         drain(recorder)
 

@@ -1,0 +1,166 @@
+"""The door to Zenoh, and the only module that imports it: the topics of one run, as bytes.
+
+Callbacks run on Zenoh's threads, where an exception is printed and lost. So nothing is decoded there: what comes in
+is handed over as a duty, for the main thread to do.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import zenoh
+
+from agent.contract.errors import InputError, RunBroken
+from agent.contract.messages import Stamp, alive, key, replay, topic_of
+from agent.network.configuration import Network, zenoh_configuration
+from agent.network.outbox import Sent
+from agent.network.words import ChannelClosed, Duty, Incoming, Peer, Replayed, Sample
+from agent.plan import LARGEST_WINDOW
+
+CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
+BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word
+
+
+class Channel:
+    """A topic's messages, in order. They wait in zenoh, without running any Python, until they are asked for."""
+
+    def __init__(self, topic: str, handler: Any) -> None:
+        self._topic, self._handler = topic, handler
+
+    def next(self) -> Sample:
+        """The next message; blocks until there is one. Raises ChannelClosed."""
+        try:
+            return _sample(self._topic, self._handler.recv())
+        except zenoh.ZError:
+            raise ChannelClosed from None
+
+    def waiting(self) -> Iterator[Sample]:
+        """The messages that are there already; does not block."""
+        while (sample := self._handler.try_recv()) is not None:
+            yield _sample(self._topic, sample)
+
+
+class Session:
+    """A zenoh session, opened for `run`; `hand_over` takes the duties, on any thread."""
+
+    def __init__(self, network: Network, *, run: str, hand_over: Callable[[Duty], None]) -> None:
+        self._run, self._hand_over = run, hand_over
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._declared: list[Any] = []  # zenoh drops what nobody holds
+        self._zenoh = _open(network)
+        self.identity = str(self._zenoh.zid())
+
+    # Data: messages of a topic, and what was missed of them.
+    def channel(self, topic: str) -> Channel:
+        """Receive a topic's messages."""
+        subscriber = self._zenoh.declare_subscriber(key(self._run, topic), zenoh.handlers.FifoChannel(CAPACITY))
+        self._declared.append(subscriber)
+        return Channel(topic, subscriber.handler)
+
+    def advertise(self, topic: str, *, express: bool) -> None:
+        """Announce that a topic will be published; an `express` message does not wait for others to go with."""
+        self._publishers[topic] = self._zenoh.declare_publisher(
+            key(self._run, topic), congestion_control=BLOCK, express=express
+        )
+
+    def publish(self, sent: Sent) -> None:
+        """Send a message of an advertised topic."""
+        self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode())
+
+    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]]) -> None:
+        """Answer requests for the messages of `who` from a number on."""
+
+        def answer(query: zenoh.Query) -> None:
+            first = query.parameters.get("from") or ""
+            with query:
+                if not first.isdecimal() or "_anyke" not in query.parameters:
+                    return  # not the recorder's question
+                for sent in since(int(first)):
+                    query.reply(key(self._run, sent.topic), sent.payload, attachment=sent.stamp.encode())
+
+        self._declared.append(
+            self._zenoh.declare_queryable(
+                key(self._run, replay(who)), lambda query: self._hand_over(lambda: answer(query))
+            )
+        )
+
+    def request_replay(self, who: str, *, first: int, seconds: float) -> None:
+        """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
+
+        def hear(reply: zenoh.Reply) -> None:
+            self._hand_over(lambda: _replayed(reply))
+
+        self._zenoh.get(
+            f"{key(self._run, replay(who))}?from={first};_anyke",  # answers come under their own keys
+            zenoh.handlers.Callback(hear, lambda: self._hand_over(lambda: Replayed(who))),
+            consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
+            timeout=seconds,
+        )
+
+    # Words that run the run.
+    def listen(self, topic: str, decode: Callable[[bytes], Incoming]) -> None:
+        """Have every word on `topic` decoded."""
+
+        def hear(sample: zenoh.Sample) -> None:
+            self._hand_over(lambda: decode(sample.payload.to_bytes()))
+
+        self._declared.append(self._zenoh.declare_subscriber(key(self._run, topic), hear))
+
+    def say(self, topic: str, payload: bytes) -> None:
+        """Send a word."""
+        self._zenoh.put(key(self._run, topic), payload, congestion_control=BLOCK)
+
+    def watch(self) -> None:
+        """Hear of everybody who is there, who comes and who goes, as Peer."""
+
+        def see(sample: zenoh.Sample) -> None:
+            who = topic_of(str(sample.key_expr)).removeprefix(alive(""))
+            self._hand_over(lambda: Peer(who, sample.kind == zenoh.SampleKind.PUT))
+
+        liveliness = self._zenoh.liveliness()
+        self._declared.append(liveliness.declare_subscriber(key(self._run, alive("*")), see, history=True))
+
+    def appear(self, who: str) -> None:
+        """Show the token of `who`, until this session is closed or its process ends."""
+        self._declared.append(self._zenoh.liveliness().declare_token(key(self._run, alive(who))))
+
+    # The session itself.
+    def locators(self) -> list[str]:
+        """The addresses at which it can be reached."""
+        for reply in self._zenoh.get(f"@/{self.identity}/peer"):
+            if reply.ok is not None:
+                return list(json.loads(reply.ok.payload.to_bytes())["locators"])
+        raise RunBroken("zenoh does not tell its own address")
+
+    def close(self) -> None:
+        """Withdraw what was declared, the last first: where that is the token, the others see us go."""
+        try:
+            for declared in reversed(self._declared):
+                declared.undeclare()
+        finally:
+            self._zenoh.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
+
+
+def _sample(topic: str, sample: zenoh.Sample) -> Sample:
+    attachment = sample.attachment
+    try:
+        stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
+    except ValueError as error:
+        raise RunBroken(f"a message on {topic} has no readable stamp: {error}") from None
+    return Sample(topic, sample.payload.to_bytes(), stamp)
+
+
+def _replayed(reply: zenoh.Reply) -> Sample | None:
+    sample = reply.ok
+    return _sample(topic_of(str(sample.key_expr)), sample) if sample is not None else None
+
+
+def _open(network: Network) -> zenoh.Session:
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(zenoh_configuration(network))))
+    except zenoh.ZError as error:
+        reason = str(error)
+        cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
+        raise InputError(f"cannot listen on {network.listen}: {cause}; port 0 takes a free one") from None

@@ -1,0 +1,98 @@
+"""What a participant hears: messages of the run, who comes and goes, the coordinator's and the recorder's word.
+
+Everything that the main thread must deal with waits in one queue, `Words`, in the order in which it came.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from typing import NamedTuple, TypeVar
+
+from agent.contract.messages import Acknowledged, Control, Ready, Stamp
+
+
+class Sample(NamedTuple):
+    """A data message as it came in. `stamp` is None where the sender left it out."""
+
+    topic: str
+    payload: bytes
+    stamp: Stamp | None
+
+
+class Peer(NamedTuple):
+    """Somebody who has come or gone."""
+
+    who: str
+    present: bool
+
+
+class Replayed(NamedTuple):
+    """The answers of `who` to a request for replay are complete."""
+
+    who: str
+
+
+Incoming = Sample | Peer | Control | Acknowledged | Ready | Replayed
+Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
+T = TypeVar("T")
+
+
+class RunClosed(Exception):
+    """The run is over; `control` says how."""
+
+    def __init__(self, control: Control) -> None:
+        super().__init__(control.reason)
+        self.control = control
+
+
+class ChannelClosed(Exception):
+    """Raised by `Channel.next` when this participant leaves."""
+
+
+class Words:
+    """The main thread's queue. Any thread may `put`; the main thread alone takes, so that failures end the process."""
+
+    def __init__(self, who: str) -> None:
+        self.present: set[str] = set()  # whose token is there
+        self.alone = True  # nobody else of this run has been heard
+        self._who = who
+        self._queue: SimpleQueue[Duty] = SimpleQueue()
+        self._early: list[Incoming] = []  # what came while something else was waited for
+
+    def put(self, duty: Duty) -> None:
+        self._queue.put(duty)
+
+    def next(self, deadline: float) -> Incoming | None:
+        """The next word, what was set aside first; None as from `take`."""
+        return self._early.pop(0) if self._early else self.take(deadline)
+
+    def take(self, deadline: float) -> Incoming | None:
+        """The next word; None at the deadline, or where a duty was done without one. Raises what a duty does."""
+        left = deadline - time.monotonic()
+        try:
+            word = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
+        except Empty:
+            return None
+        if word is not None and not (isinstance(word, Peer) and word.who == self._who):
+            self.alone = False
+        match word:
+            case Peer(who=who, present=True):
+                self.present.add(who)
+            case Peer(who=who):
+                self.present.discard(who)
+        return word
+
+    def set_aside(self, word: Incoming) -> None:
+        """Keep a word for `next`."""
+        self._early.append(word)
+
+    def early(self, kind: type[T]) -> T | None:
+        """The first word of one kind that was set aside."""
+        for word in self._early:
+            if isinstance(word, kind):
+                self._early.remove(word)
+                return word
+        return None
