@@ -1,4 +1,4 @@
-"""What the recorder has, and what it lacks. Pure."""
+"""Receipts for the messages of a run: what the recorder has, and what it lacks. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from agent.contract.messages import MODE, PLANT_STATE, Stamp, estimate, measurem
 from agent.contract.problem import Problem
 
 
-class Ledger:
+class Receipts:
     """Counts messages by sender, and the steps of which every message is there."""
 
     def __init__(self, problem: Problem) -> None:

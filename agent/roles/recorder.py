@@ -28,7 +28,7 @@ from agent.contract.recording.writer import RecordingWriter, refuse_recording
 from agent.network.bus import Bus
 from agent.network.session import Channel
 from agent.network.words import RunClosed, Sample
-from agent.receipts import Ledger
+from agent.receipts import Receipts
 from agent.roles.joining import join
 
 SHORTEST_PAUSE = 0.002  # s, while messages come; they wait in their channels meanwhile
@@ -58,14 +58,14 @@ def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
 
 
 class Recorder:
-    """The open recording, and the ledger of what is in it."""
+    """The open recording, and the receipts for what is in it."""
 
     def __init__(
         self, bus: Bus, channels: list[Channel], gains: Gains, writer: RecordingWriter, *, window: int
     ) -> None:
         self._bus, self._channels, self._writer = bus, channels, writer
         self._publishers = [COORDINATOR, PLANT, *map(node_who, gains.problem.node_names)]
-        self._ledger = Ledger(gains.problem)
+        self._receipts = Receipts(gains.problem)
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._acknowledged = 0
         self._closing = False
@@ -85,11 +85,11 @@ class Recorder:
 
     def _write_waiting(self) -> bool:
         """Write what has come, acknowledging on the way; False where there was nothing."""
-        before = self._ledger.messages
+        before = self._receipts.messages
         for channel in self._channels:
             for sample in channel.waiting():
                 self._write(sample)
-        new_steps, new_messages = self._ledger.complete - self._acknowledged, self._ledger.messages - before
+        new_steps, new_messages = self._receipts.complete - self._acknowledged, self._receipts.messages - before
         if new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
             self._acknowledge()
         return new_messages > 0
@@ -102,12 +102,12 @@ class Recorder:
         for sample in self._bus.replayed(self._publishers):
             self._write(sample)
         self._write_waiting()  # what came meanwhile
-        ledger = self._ledger
-        end = {"status": status, "reason": reason, "steps": str(ledger.complete)}
-        for who in sorted(ledger.reached):
-            end[f"received.{who}"] = str(ledger.received.get(who, 0))
-            end[f"reached.{who}"] = str(ledger.reached[who])
-            end[f"missing.{who}"] = str(ledger.missing(who))  # before the last that is there
+        receipts = self._receipts
+        end = {"status": status, "reason": reason, "steps": str(receipts.complete)}
+        for who in sorted(receipts.reached):
+            end[f"received.{who}"] = str(receipts.received.get(who, 0))
+            end[f"reached.{who}"] = str(receipts.reached[who])
+            end[f"missing.{who}"] = str(receipts.missing(who))  # before the last that is there
         self._writer.finish(end)
         self._acknowledge(closed=True)
         self._bus.wait_until_gone(self._publishers)
@@ -119,7 +119,7 @@ class Recorder:
             if self._closing:  # no foreign message shall keep the file from being closed
                 return
             raise
-        if not self._ledger.take(sample.topic, step, sample.stamp):
+        if not self._receipts.take(sample.topic, step, sample.stamp):
             return
         now = time.time_ns()
         number, published = sample.stamp[:2] if sample.stamp is not None else (0, now)
@@ -129,24 +129,24 @@ class Recorder:
     def _complain(self) -> None:
         """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
         self._ask_everybody()
-        self._acknowledge(lacking=self._ledger.lacking())
+        self._acknowledge(lacking=self._receipts.lacking())
         self._quiet_since = time.monotonic()
 
     def _ask_everybody(self) -> None:
         """For the messages that we do not hold; they come as samples."""
         for who in self._publishers:
-            self._bus.request_replay(who, first=self._ledger.received.get(who, 0))
+            self._bus.request_replay(who, first=self._receipts.received.get(who, 0))
 
     def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False) -> None:
-        ledger = self._ledger
-        self._acknowledged = ledger.complete
+        receipts = self._receipts
+        self._acknowledged = receipts.complete
         self._bus.acknowledge(
             Acknowledged(
-                steps=ledger.complete,
-                messages=ledger.messages,
-                missing=sum(map(ledger.missing, ledger.reached)),
-                received=ledger.received,
-                reached=ledger.reached,
+                steps=receipts.complete,
+                messages=receipts.messages,
+                missing=sum(map(receipts.missing, receipts.reached)),
+                received=receipts.received,
+                reached=receipts.reached,
                 lacking=lacking or [],
                 closed=closed,
             )

@@ -1,4 +1,4 @@
-"""The ledger's account depends on what came, not on when; what is missing is counted and named."""
+"""The recorder's receipts depend on what came, not on when; what is missing is counted and named."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from made_recordings import random_gains, random_problem, simulate
 
 from agent.contract.messages import Stamp
-from agent.receipts import Ledger
+from agent.receipts import Receipts
 
 STEPS = 6
 PROBLEM = random_problem(3, ny=(1, 2), modes=2)
@@ -25,32 +25,32 @@ SENDERS = {
 }
 
 
-def filled(entries: list[Entry]) -> Ledger:
-    ledger = Ledger(PROBLEM)
+def filled(entries: list[Entry]) -> Receipts:
+    receipts = Receipts(PROBLEM)
     for entry in entries:
-        ledger.take(*entry)
-    return ledger
+        receipts.take(*entry)
+    return receipts
 
 
-def account(ledger: Ledger) -> tuple[object, ...]:
-    missing = {sender: ledger.missing(sender) for sender in SENDERS}
+def account(receipts: Receipts) -> tuple[object, ...]:
+    missing = {sender: receipts.missing(sender) for sender in SENDERS}
     return (
-        ledger.complete,
-        ledger.messages,
-        {sender: count for sender, count in ledger.received.items() if count},
-        ledger.reached,
+        receipts.complete,
+        receipts.messages,
+        {sender: count for sender, count in receipts.received.items() if count},
+        receipts.reached,
         missing,
-        ledger.lacking(),
+        receipts.lacking(),
     )
 
 
 def test_a_whole_run_is_complete() -> None:
-    ledger = filled(ENTRIES)
-    assert ledger.complete == STEPS
-    assert ledger.received == SENDERS
-    assert ledger.reached == dict.fromkeys(SENDERS, STEPS - 1)
-    assert ledger.messages == len(ENTRIES)
-    assert all(ledger.missing(sender) == 0 for sender in SENDERS)
+    receipts = filled(ENTRIES)
+    assert receipts.complete == STEPS
+    assert receipts.received == SENDERS
+    assert receipts.reached == dict.fromkeys(SENDERS, STEPS - 1)
+    assert receipts.messages == len(ENTRIES)
+    assert all(receipts.missing(sender) == 0 for sender in SENDERS)
 
 
 @given(st.permutations(ENTRIES))
@@ -67,42 +67,42 @@ def test_what_is_there_counts_once_whatever_the_order(entries: list[Entry]) -> N
 @given(st.lists(st.sampled_from(ENTRIES), max_size=80))
 def test_the_account_is_true(entries: list[Entry]) -> None:
     """Against the plain definitions: prefixes without a gap, steps of which all is there, the first lack."""
-    ledger, there = filled(entries), set(entries)
+    receipts, there = filled(entries), set(entries)
     whole = [all(entry in there for entry in ENTRIES if entry[1] == k and entry[0] != "event") for k in range(STEPS)]
-    assert ledger.complete == [*whole, False].index(False)
+    assert receipts.complete == [*whole, False].index(False)
     for sender in SENDERS:
         numbers = {stamp.number for _, _, stamp in there if stamp.sender == sender}
         prefix = next(number for number in range(len(ENTRIES)) if number not in numbers)
-        assert ledger.received.get(sender, 0) == prefix
-        assert ledger.missing(sender) == (max(numbers) + 1 - len(numbers) if numbers else 0)
+        assert receipts.received.get(sender, 0) == prefix
+        assert receipts.missing(sender) == (max(numbers) + 1 - len(numbers) if numbers else 0)
         steps = [step for _, step, stamp in there if stamp.sender == sender]
-        assert ledger.reached.get(sender) == max(steps, default=None)
-    has = {topic for topic, step, _ in there if step == ledger.complete}
-    assert set(ledger.lacking()) == {topic for topic, _, _ in ENTRIES if topic != "event"} - has
+        assert receipts.reached.get(sender) == max(steps, default=None)
+    has = {topic for topic, step, _ in there if step == receipts.complete}
+    assert set(receipts.lacking()) == {topic for topic, _, _ in ENTRIES if topic != "event"} - has
 
 
 def test_a_duplicate_is_not_recorded_again() -> None:
-    ledger = Ledger(PROBLEM)
-    assert [ledger.take(*ENTRIES[0]) for _ in range(3)] == [True, False, False]
-    assert ledger.messages == 1
+    receipts = Receipts(PROBLEM)
+    assert [receipts.take(*ENTRIES[0]) for _ in range(3)] == [True, False, False]
+    assert receipts.messages == 1
 
 
 def test_a_duplicate_of_what_came_early_is_not_recorded_again() -> None:
-    ledger = Ledger(PROBLEM)
+    receipts = Receipts(PROBLEM)
     early = ("mode", 4, Stamp(4, 0, "coordinator"))
-    assert [ledger.take(*early) for _ in range(2)] == [True, False]
+    assert [receipts.take(*early) for _ in range(2)] == [True, False]
 
 
 @pytest.mark.parametrize("number", [0, 2, 5])
 def test_a_gap_is_found_and_filled(number: int) -> None:
     whole = [entry for entry in ENTRIES if entry[2].sender == "node-n1"]
-    ledger = filled([entry for entry in whole if entry[2].number != number])
+    receipts = filled([entry for entry in whole if entry[2].number != number])
     last = number == len(whole) - 1
-    assert ledger.missing("node-n1") == (0 if last else 1)  # the end of a sender's messages is not known
-    assert ledger.received.get("node-n1", 0) == number
-    ledger.take(*whole[number])
-    assert ledger.missing("node-n1") == 0
-    assert ledger.received["node-n1"] == len(whole)
+    assert receipts.missing("node-n1") == (0 if last else 1)  # the end of a sender's messages is not known
+    assert receipts.received.get("node-n1", 0) == number
+    receipts.take(*whole[number])
+    assert receipts.missing("node-n1") == 0
+    assert receipts.received["node-n1"] == len(whole)
 
 
 def test_lacking_names_what_keeps_the_step_incomplete_in_the_order_in_which_it_comes_about() -> None:
@@ -114,23 +114,25 @@ def test_lacking_names_what_keeps_the_step_incomplete_in_the_order_in_which_it_c
         "node/n0/estimate",
         "node/n1/estimate",
     ]
-    assert Ledger(PROBLEM).lacking() == order
-    ledger = filled([entry for entry in ENTRIES if entry[:2] not in {("node/n1/estimate", 2), ("node/n0/estimate", 4)}])
-    assert ledger.complete == 2
-    assert ledger.lacking() == ["node/n1/estimate"]
+    assert Receipts(PROBLEM).lacking() == order
+    receipts = filled(
+        [entry for entry in ENTRIES if entry[:2] not in {("node/n1/estimate", 2), ("node/n0/estimate", 4)}]
+    )
+    assert receipts.complete == 2
+    assert receipts.lacking() == ["node/n1/estimate"]
 
 
 def test_a_sensor_without_stamps_counts_for_its_steps() -> None:
     """It has no numbers, so its gaps show by the steps alone."""
-    ledger = Ledger(PROBLEM)
+    receipts = Receipts(PROBLEM)
     for topic, step, stamp in ENTRIES:
-        ledger.take(topic, step, None if topic == "node/n1/measurement" else stamp)
-    assert ledger.complete == STEPS
-    assert ledger.reached["sensor of node/n1/measurement"] == STEPS - 1
-    assert ledger.messages == len(ENTRIES)
+        receipts.take(topic, step, None if topic == "node/n1/measurement" else stamp)
+    assert receipts.complete == STEPS
+    assert receipts.reached["sensor of node/n1/measurement"] == STEPS - 1
+    assert receipts.messages == len(ENTRIES)
 
 
 def test_events_complete_no_step() -> None:
-    ledger = filled([("event", 0, Stamp(number, 0, "coordinator")) for number in range(10)])
-    assert ledger.complete == 0
-    assert ledger.messages == 10
+    receipts = filled([("event", 0, Stamp(number, 0, "coordinator")) for number in range(10)])
+    assert receipts.complete == 0
+    assert receipts.messages == 10
