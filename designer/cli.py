@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 import agent.cli
+from agent.commands.roles import add_roles
 from agent.contract.errors import EXIT_INPUT
 from designer.commands import analyse, design, recordings, reproduce, runs, show, simulate, verify
 
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     recordings.add_report(commands)
     reproduce.add_reproduce(commands)
     show.add_show(commands)
-    agent.cli.add_roles(commands)
+    add_roles(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help(sys.stderr)

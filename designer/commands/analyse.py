@@ -6,15 +6,15 @@ import argparse
 import json
 from pathlib import Path
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
 
 
-def add_analyse(commands: agent.cli.Subcommands) -> None:
+def add_analyse(commands: Subcommands) -> None:
     """Describe `analyse` to the parser."""
-    analyse = agent.cli.add_command(
+    analyse = add_command(
         commands, "analyse", analyse_command, "the exact gain of any gains on a problem, and the worst disturbances"
     )
     analyse.add_argument("problem", metavar="PROBLEM", help=PROBLEM)

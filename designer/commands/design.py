@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
@@ -26,9 +26,9 @@ METHODS = (
 )
 
 
-def add_design(commands: agent.cli.Subcommands) -> None:
+def add_design(commands: Subcommands) -> None:
     """Describe `design` to the parser."""
-    design = agent.cli.add_command(commands, "design", design_command, "gains with a certificate, for a problem")
+    design = add_command(commands, "design", design_command, "gains with a certificate, for a problem")
     design.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
     design.add_argument("-o", "--output", type=Path, metavar="FILE", help="gains file (<problem>.gains.json)")
     add_method(design)

@@ -6,15 +6,13 @@ import argparse
 import json
 from pathlib import Path
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD
 
 
-def add_replay(commands: agent.cli.Subcommands) -> None:
+def add_replay(commands: Subcommands) -> None:
     """Describe `replay` to the parser."""
-    replay = agent.cli.add_command(
-        commands, "replay", replay_command, "hold a recording against the centralised error model"
-    )
+    replay = add_command(commands, "replay", replay_command, "hold a recording against the centralised error model")
     replay.add_argument("recording", type=Path, metavar="RECORDING", help="recording, or the .part of one that was cut")
     replay.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -28,9 +26,9 @@ def replay_command(options: argparse.Namespace) -> int:
     return verdict.exit_code
 
 
-def add_report(commands: agent.cli.Subcommands) -> None:
+def add_report(commands: Subcommands) -> None:
     """Describe `report` to the parser."""
-    report = agent.cli.add_command(commands, "report", report_command, "pictures of a recording, as SVG and PNG")
+    report = add_command(commands, "report", report_command, "pictures of a recording, as SVG and PNG")
     report.add_argument("recording", type=Path, metavar="RECORDING", help="MCAP file of a run")
     report.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="where to (beside the recording)")
     report.add_argument("--force", action="store_true", help="replace pictures that exist")

@@ -6,13 +6,13 @@ import argparse
 import json
 import sys
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD
 
 
-def add_reproduce(commands: agent.cli.Subcommands) -> None:
+def add_reproduce(commands: Subcommands) -> None:
     """Describe `reproduce` to the parser."""
-    reproduce = agent.cli.add_command(
+    reproduce = add_command(
         commands, "reproduce", reproduce_command, "the paper's two examples: printed beside computed (a minute or two)"
     )
     reproduce.add_argument("--json", action="store_true", help="print one JSON object")

@@ -8,7 +8,9 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-import agent.cli
+import agent.commands.run
+from agent.commands.options import Subcommands, add_command, default_recording
+from agent.commands.words import run_text
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
@@ -16,14 +18,12 @@ from designer.commands.design import add_method, design_and_save, design_text
 from designer.commands.recordings import write_pictures
 
 
-def add_demo(commands: agent.cli.Subcommands) -> None:
+def add_demo(commands: Subcommands) -> None:
     """Describe `demo` to the parser."""
-    demo = agent.cli.add_command(
-        commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)"
-    )
+    demo = add_command(commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)")
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
     add_method(demo)
-    agent.cli.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
+    agent.commands.run.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
 
 
 def demo_command(options: argparse.Namespace) -> int:
@@ -42,8 +42,8 @@ def demo_command(options: argparse.Namespace) -> int:
 
     gains, designed = design_and_save(problem, options.method, gains_path, force=options.force)
     _say(options, f"1. design\n{design_text(designed)}")
-    ran = agent.cli.run_gains(gains_path, gains, options)
-    _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{agent.cli.run_text(ran)}")
+    ran = agent.commands.run.run_gains(gains_path, gains, options)
+    _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{run_text(ran)}")
     verdict = replay(options.output)
     _say(options, f"\n3. replay\n{verdict.text()}")
     pictures = write_pictures(options.output, folder, force=options.force)
@@ -59,12 +59,12 @@ def _say(options: argparse.Namespace, text: str) -> None:
         print(text, flush=True)
 
 
-def add_run(commands: agent.cli.Subcommands) -> None:
+def add_run(commands: Subcommands) -> None:
     """Describe `run` to the parser."""
-    run = agent.cli.add_command(commands, "run", run_command, "run every role as a process on this machine")
+    run = add_command(commands, "run", run_command, "run every role as a process on this machine")
     run.add_argument("gains", metavar="PROBLEM_OR_GAINS", help=f"gains file, {PROBLEM}")
     add_method(run)
-    agent.cli.add_run_options(run)
+    agent.commands.run.add_run_options(run)
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -74,17 +74,17 @@ def run_command(options: argparse.Namespace) -> int:
         if options.method is not None:
             raise InputError(f"--method says how to design a problem; {path} has its gains already")
         options.gains = path
-        return agent.cli.run_command(options)
+        return agent.commands.run.run_command(options)
     from designer.ladder import rounded_up
     from designer.problems import find
 
     problem = find(options.gains)
     if options.output is None:
-        options.output = agent.cli.default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
+        options.output = default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_overwrite(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
     gains, _ = design_and_save(problem, options.method, path, force=options.force)
     print(f"designed {path}, gamma = {rounded_up(gains.certificate.gamma)}", file=sys.stderr)
-    result = {"gains": str(path), **agent.cli.run_gains(path, gains, options)}
-    print(json.dumps(result) if options.json else f"{agent.cli.run_text(result)}\ngains      {path}")
+    result = {"gains": str(path), **agent.commands.run.run_gains(path, gains, options)}
+    print(json.dumps(result) if options.json else f"{run_text(result)}\ngains      {path}")
     return EXIT_GOOD

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD
 
 
-def add_show(commands: agent.cli.Subcommands) -> None:
+def add_show(commands: Subcommands) -> None:
     """Describe `show` to the parser."""
-    show = agent.cli.add_command(commands, "show", show_command, "what a file is; without one, the built-in problems")
+    show = add_command(commands, "show", show_command, "what a file is; without one, the built-in problems")
     show.add_argument("file", nargs="?", metavar="FILE", help="problem, gains file or recording")
     show.add_argument("--json", action="store_true", help="print one JSON object")
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command, count, load_gains, seed
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite, write_whole
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 WORST_CASE = "worst-case"
 
 
-def add_simulate(commands: agent.cli.Subcommands) -> None:
+def add_simulate(commands: Subcommands) -> None:
     """Describe `simulate` to the parser."""
-    simulate = agent.cli.add_command(
+    simulate = add_command(
         commands, "simulate", simulate_command, "many runs at once: the mean square of the errors, held against gamma"
     )
     simulate.add_argument("gains", type=Path, metavar="GAINS", help="gains file, from peakmesh design")
-    simulate.add_argument("--runs", type=agent.cli.count, default=1000, metavar="N", help="how many runs (1000)")
-    simulate.add_argument("--steps", type=agent.cli.count, default=200, metavar="N", help="steps of each (200)")
-    simulate.add_argument("--seed", type=agent.cli.seed, default=0, metavar="N", help="of run 0; run r has N + r (0)")
+    simulate.add_argument("--runs", type=count, default=1000, metavar="N", help="how many runs (1000)")
+    simulate.add_argument("--steps", type=count, default=200, metavar="N", help="steps of each (200)")
+    simulate.add_argument("--seed", type=seed, default=0, metavar="N", help="of run 0; run r has N + r (0)")
     simulate.add_argument(
         "--disturbance",
         choices=["problem", WORST_CASE],
@@ -38,7 +38,7 @@ def add_simulate(commands: agent.cli.Subcommands) -> None:
         help="what the problem says, or the sequence of energy 1 that is worst for these gains (problem)",
     )
     simulate.add_argument("--dask", metavar="ADDRESS", help="spread the runs over this Dask cluster")
-    simulate.add_argument("--processes", type=agent.cli.count, metavar="N", help="of this machine (one for each core)")
+    simulate.add_argument("--processes", type=count, metavar="N", help="of this machine (one for each core)")
     simulate.add_argument("-o", "--output", type=Path, metavar="FILE", help="a CSV file with a row for each step")
     simulate.add_argument("--force", action="store_true", help="replace the CSV file if it exists")
     simulate.add_argument("--json", action="store_true", help="print one JSON object")
@@ -60,7 +60,7 @@ def simulate_command(options: argparse.Namespace) -> int:
     """
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
-    gains = agent.cli.load_gains(options.gains)
+    gains = load_gains(options.gains)
     kind, w = options.disturbance, None
     if kind == WORST_CASE:
         w = _worst_case(gains)

@@ -7,7 +7,7 @@ import json
 import time
 from pathlib import Path
 
-import agent.cli
+from agent.commands.options import Subcommands, add_command, load_gains
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 
 PROVED = {
@@ -16,9 +16,9 @@ PROVED = {
 }
 
 
-def add_verify(commands: agent.cli.Subcommands) -> None:
+def add_verify(commands: Subcommands) -> None:
     """Describe `verify` to the parser."""
-    verify = agent.cli.add_command(commands, "verify", verify_command, "prove a certificate again, without a solver")
+    verify = add_command(commands, "verify", verify_command, "prove a certificate again, without a solver")
     verify.add_argument("gains", type=Path, metavar="GAINS", help="gains file")
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -27,7 +27,7 @@ def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS`."""
     from designer.proof.certificate import verify
 
-    gains = agent.cli.load_gains(options.gains)
+    gains = load_gains(options.gains)
     started = time.perf_counter()
     try:
         verdict = verify(gains)

@@ -1,0 +1,116 @@
+"""What commands take: how options are declared, and what is read from them."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from agent.contract.errors import InputError
+from agent.plan import LARGEST_WINDOW, Plan
+
+if TYPE_CHECKING:
+    from agent.contract.gains import Gains
+
+Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # what add_subparsers returns
+
+RECORDING = "FILE", "recording (recordings/<run>.mcap)"
+
+
+def add_command(
+    commands: Subcommands, name: str, call: Callable[[argparse.Namespace], int], about: str
+) -> argparse.ArgumentParser:
+    """Add a command that `perform` will call."""
+    parser = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+    parser.set_defaults(call=call)
+    parser.add_argument("-v", "--verbose", action="store_true", help="show where an error came from")
+    return parser
+
+
+def add_plan_options(parser: argparse.ArgumentParser) -> None:
+    """Add what the coordinator decides; `plan_of` reads it."""
+    parser.add_argument("--steps", type=count, default=200, metavar="N", help="how many steps (200)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of modes, losses, disturbance (0)")
+    parser.add_argument(
+        "--window", type=_window, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
+    )
+    parser.add_argument(
+        "--deadline", type=positive, default=10.0, metavar="S", help="seconds without progress that stop a run (10)"
+    )
+    parser.add_argument(
+        "--external",
+        action="append",
+        default=[],
+        metavar="NODE",
+        help="the measurements of this node come from a sensor, not from the simulated plant; may be repeated",
+    )
+
+
+def add_output_options(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:
+    """Add where to write, and whether over what is there."""
+    parser.add_argument("-o", "--output", type=Path, metavar=metavar, help=about)
+    parser.add_argument("--force", action="store_true", help="replace what exists")
+
+
+def run_name(text: str) -> str:
+    """The type of --run."""
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,128}", text):  # it becomes one part of every key expression
+        raise argparse.ArgumentTypeError(f'{text!r} is not a legal name: use letters, digits, "-" and "_"')
+    return text
+
+
+def positive(text: str) -> float:
+    """The type of options that say how many seconds."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
+    return value
+
+
+def _whole(text: str, *, least: int, most: int) -> int:
+    if not (text.isdecimal() and len(text) < 20 and least <= int(text) <= most):
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number from {least} to {most}")
+    return int(text)
+
+
+def count(text: str) -> int:
+    """The type of options that say how many."""
+    return _whole(text, least=1, most=2**31 - 1)
+
+
+def _window(text: str) -> int:
+    return _whole(text, least=1, most=LARGEST_WINDOW)
+
+
+def seed(text: str) -> int:
+    """The type of --seed."""
+    return _whole(text, least=0, most=2**63 - 1)
+
+
+def load_gains(path: Path) -> Gains:
+    """Read a gains file, importing what that needs only now."""
+    from agent.contract.gains import Gains
+
+    return Gains.load(path)
+
+
+def plan_of(options: argparse.Namespace, gains: Gains) -> Plan:
+    """What the options of `add_plan_options` ask for. Raises InputError where the gains do not go with it."""
+    for name in options.external:
+        gains.problem.node_index(name)
+    most = (2**32 - 1) // (gains.problem.n + 1) - 1  # the plant's messages are numbered in 32 bits
+    if options.steps > most:
+        raise InputError(f"--steps {options.steps}: a recording of {gains.problem.n} nodes holds at most {most}")
+    return Plan(options.steps, options.seed, options.window, options.deadline, tuple(options.external))
+
+
+def default_recording(run: str) -> Path:
+    """recordings/<run>.mcap, in the current folder."""
+    folder = Path("recordings")
+    folder.mkdir(exist_ok=True)
+    return folder / f"{run}.mcap"

@@ -1,0 +1,160 @@
+"""`peakmesh node`, `plant`, `coordinator` and `recorder`: one role in this process, for separate machines."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agent.commands.options import (
+    RECORDING,
+    Subcommands,
+    add_command,
+    add_output_options,
+    add_plan_options,
+    default_recording,
+    load_gains,
+    plan_of,
+    positive,
+    run_name,
+)
+from agent.commands.words import say_to_launcher, say_to_person
+from agent.contract.errors import EXIT_GOOD, InputError, RunBroken
+
+if TYPE_CHECKING:
+    from agent.contract.gains import Gains
+    from agent.network.configuration import Network
+
+
+def add_roles(commands: Subcommands) -> None:
+    """Add the commands that take one role each."""
+    node = _role(commands, "node", node_command, "take part as one sensor node")
+    node.add_argument("--node", required=True, metavar="NAME", help="which node of the problem")
+    _role(commands, "plant", plant_command, "take part as the simulated plant")
+    coordinator = _role(commands, "coordinator", coordinator_command, "start the run, give out the modes, end it")
+    add_plan_options(coordinator)
+    recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
+    add_output_options(recorder, *RECORDING)
+
+
+def _role(
+    commands: Subcommands, name: str, call: Callable[[argparse.Namespace], int], about: str
+) -> argparse.ArgumentParser:
+    parser = add_command(commands, name, call, about)
+    parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, the same for everybody")
+    _network_options(parser)
+    return parser
+
+
+def _network_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--run", type=run_name, metavar="NAME", help="name of the run, the same for everybody (the problem's name)"
+    )
+    parser.add_argument(
+        "--listen",
+        default="tcp/127.0.0.1:0",
+        metavar="ADDRESS",
+        help="where to be reached (tcp/127.0.0.1:0; port 0 takes a free one)",
+    )
+    parser.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ADDRESS",
+        help="required: of the coordinator, for example tcp/127.0.0.1:7447",
+    )
+    parser.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+
+
+def node_command(options: argparse.Namespace) -> int:
+    """`peakmesh node GAINS --node NAME`."""
+    from agent.contract.messages import node_who
+    from agent.roles import node
+
+    gains = load_gains(options.gains)
+    gains.problem.node_index(options.node)
+    return _publisher(options, gains, node_who(options.node), lambda bus: node.run(bus, gains, node=options.node))
+
+
+def plant_command(options: argparse.Namespace) -> int:
+    """`peakmesh plant GAINS`."""
+    from agent.contract.messages import PLANT
+    from agent.roles import plant
+
+    gains = load_gains(options.gains)
+    return _publisher(options, gains, PLANT, lambda bus: plant.run(bus, gains))
+
+
+def coordinator_command(options: argparse.Namespace) -> int:
+    """`peakmesh coordinator GAINS`."""
+    from agent.contract.messages import COORDINATOR
+    from agent.network.bus import Bus
+    from agent.roles import coordinator
+
+    gains = load_gains(options.gains)
+    plan = plan_of(options, gains)
+    say = say_to_launcher if options.child else say_to_person
+    with Bus(_network(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
+        say({"listening": bus.locators()})
+        summary = coordinator.run(bus, gains, plan, report=say)
+    say({"summary": summary._asdict()})
+    return EXIT_GOOD
+
+
+def recorder_command(options: argparse.Namespace) -> int:
+    """`peakmesh recorder GAINS -o FILE`."""
+    from agent.contract.messages import RECORDER
+    from agent.network.bus import Bus
+    from agent.roles import recorder
+
+    gains = load_gains(options.gains)
+    run = options.run or gains.problem.name
+    path = options.output or default_recording(run)
+    with Bus(_network(options), run=run, who=RECORDER) as bus:
+        recorder.run(bus, gains, path=path, force=options.force)
+    print(f"recording  {path}")
+    return EXIT_GOOD
+
+
+def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
+    from agent.contract.messages import in_words
+    from agent.network.bus import Bus
+
+    run = options.run or gains.problem.name
+    with Bus(_network(options), run=run, who=who) as bus:
+        if not options.child:
+            print(f'{in_words(who)} waits for everybody of run "{run}"', file=sys.stderr)
+        role(bus)
+    return EXIT_GOOD
+
+
+def _network(options: argparse.Namespace) -> Network:
+    from agent.network.configuration import Network
+
+    connect = tuple(options.connect)
+    if options.child:
+        if options.command != "coordinator":
+            connect = (sys.stdin.readline().strip(),)
+            if connect == ("",):
+                raise RunBroken("the launcher ended before the run had started")
+        threading.Thread(target=_stop_with_launcher, daemon=True).start()
+    elif options.command != "coordinator" and not connect:
+        raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
+    for option, addresses in (("--listen", (options.listen,)), ("--connect", connect)):
+        for address in addresses:
+            if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
+                raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
+    return Network(options.listen, connect, options.wait)
+
+
+def _stop_with_launcher() -> None:
+    while os.read(sys.stdin.fileno(), 1):  # not sys.stdin.read: its lock would outlive us at exit
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,61 @@
+"""What a run says while it goes on, and when it has ended."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+def say_to_launcher(word: dict[str, Any]) -> None:
+    """A word of the coordinator, as a line of JSON."""
+    print(json.dumps(word), flush=True)
+
+
+def say_to_person(word: dict[str, Any]) -> None:
+    """A word of the coordinator, as a sentence."""
+    from agent.contract.messages import in_words
+
+    match word:
+        case {"listening": addresses}:
+            print(f"listening at {', '.join(addresses)}", file=sys.stderr)
+        case {"joined": who}:
+            print(f"{in_words(who)} is there", file=sys.stderr)
+        case {"started": _}:
+            print("everybody is there: the run starts", file=sys.stderr)
+        case {"summary": summary}:
+            print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
+
+
+@contextmanager
+def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A bar on stderr, where that is a terminal; the function takes the coordinator's words."""
+    if not sys.stderr.isatty():
+        yield lambda word: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("waiting for everybody", total=steps)
+
+        def show(word: dict[str, Any]) -> None:
+            if "started" in word:
+                bar.update(task, description="steps")
+            elif "complete" in word:
+                bar.update(task, completed=word["complete"])
+
+        yield show
+
+
+def run_text(result: dict[str, Any]) -> str:
+    """The facts of a run, for people."""
+    return (
+        f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
+        f"{result['missing']} missing\n"
+        f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s\n"
+        f"recording  {result['recording']}\n"
+        f"next       peakmesh replay {result['recording']}"
+    )
