@@ -20,7 +20,7 @@ from typing import IO, Any, NamedTuple
 
 from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import COORDINATOR, PLANT, RECORDER, in_words, node_who
+from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
 from agent.plan import Plan
 
 RECORDER_SECONDS = 10.0  # after the coordinator has gone, the recorder has so long to close before it is killed

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from agent.contract.messages import MODE, PLANT_STATE, Stamp, estimate, measurement
+from agent.contract.keys import MODE, PLANT_STATE, estimate, measurement
+from agent.contract.messages import Stamp
 from agent.contract.problem import Problem
 
 

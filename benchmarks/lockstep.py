@@ -25,7 +25,7 @@ from typing import Any
 import unix_sockets
 
 from agent.contract.gains import Gains
-from agent.contract.messages import estimate
+from agent.contract.keys import estimate
 from agent.contract.recording.reader import RecordingReader
 
 GOLDEN = Path(__file__).parents[1] / "recordings" / "golden" / "zhu2020-lossy.gains.json"

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from agent import filter as node
-from agent.contract import messages, schedule
+from agent.contract import keys, messages, schedule
 from agent.contract.gains import Certificate, Gains, Solver
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
@@ -99,7 +99,7 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
     x_hat, mode, sent = (
         {name: np.zeros(problem.nx) for name in problem.node_names},
         "",
-        dict.fromkeys([messages.COORDINATOR, messages.PLANT, *problem.node_names], 0),
+        dict.fromkeys([keys.COORDINATOR, keys.PLANT, *problem.node_names], 0),
     )
     with RecordingWriter(path, run=run, gains=gains) as writer:
 
@@ -112,7 +112,7 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
             state, measurements = plant.advance(k)
             pairs = {}
             for name, y in measurements.items():
-                put(messages.measurement(name), messages.PLANT, y)
+                put(keys.measurement(name), keys.PLANT, y)
                 innovation = node.innovation(slices[name], np.array(y.y), x_hat[name])
                 pairs[name] = node.Pair(x_hat[name], innovation)
                 estimate = messages.Estimate(
@@ -123,10 +123,10 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
                     mode=mode,
                     heard=hears[name][mode] if k else [],
                 )
-                put(messages.estimate(name), name, estimate)
-            put(messages.PLANT_STATE, messages.PLANT, state)
+                put(keys.estimate(name), name, estimate)
+            put(keys.PLANT_STATE, keys.PLANT, state)
             mode = problem.mode_names[next(chain)]
-            put(messages.MODE, messages.COORDINATOR, messages.Mode(step=k, mode=mode))
+            put(keys.MODE, keys.COORDINATOR, messages.Mode(step=k, mode=mode))
             x_hat = {name: node.step(part, mode, pairs) for name, part in slices.items()}
         writer.finish({"status": "finished", "reason": "", "steps": str(steps)})
 

@@ -25,7 +25,8 @@ import numpy as np
 
 from agent.contract import schedule
 from agent.contract.gains import Gains
-from agent.contract.messages import COORDINATOR, PLANT, RECORDER, Estimate, Measurement, Mode, node_who, participants
+from agent.contract.keys import COORDINATOR, PLANT, RECORDER, node_who, participants
+from agent.contract.messages import Estimate, Measurement, Mode
 from agent.filter import innovation, step
 from agent.inbox import Inbox
 from agent.roles.plant import SimulatedPlant

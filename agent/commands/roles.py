@@ -75,7 +75,7 @@ def _network_options(parser: argparse.ArgumentParser) -> None:
 
 def node_command(options: argparse.Namespace) -> int:
     """`peakmesh node GAINS --node NAME`."""
-    from agent.contract.messages import node_who
+    from agent.contract.keys import node_who
     from agent.roles import node
 
     gains = load_gains(options.gains)
@@ -85,7 +85,7 @@ def node_command(options: argparse.Namespace) -> int:
 
 def plant_command(options: argparse.Namespace) -> int:
     """`peakmesh plant GAINS`."""
-    from agent.contract.messages import PLANT
+    from agent.contract.keys import PLANT
     from agent.roles import plant
 
     gains = load_gains(options.gains)
@@ -94,7 +94,7 @@ def plant_command(options: argparse.Namespace) -> int:
 
 def coordinator_command(options: argparse.Namespace) -> int:
     """`peakmesh coordinator GAINS`."""
-    from agent.contract.messages import COORDINATOR
+    from agent.contract.keys import COORDINATOR
     from agent.network.bus import Bus
     from agent.roles import coordinator
 
@@ -110,7 +110,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
 
 def recorder_command(options: argparse.Namespace) -> int:
     """`peakmesh recorder GAINS -o FILE`."""
-    from agent.contract.messages import RECORDER
+    from agent.contract.keys import RECORDER
     from agent.network.bus import Bus
     from agent.roles import recorder
 
@@ -124,7 +124,7 @@ def recorder_command(options: argparse.Namespace) -> int:
 
 
 def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
-    from agent.contract.messages import in_words
+    from agent.contract.keys import in_words
     from agent.network.bus import Bus
 
     run = options.run or gains.problem.name

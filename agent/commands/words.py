@@ -16,7 +16,7 @@ def say_to_launcher(word: dict[str, Any]) -> None:
 
 def say_to_person(word: dict[str, Any]) -> None:
     """A word of the coordinator, as a sentence."""
-    from agent.contract.messages import in_words
+    from agent.contract.keys import in_words
 
     match word:
         case {"listening": addresses}:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from agent.contract.messages import MODE, PLANT_STATE, estimate
+from agent.contract.keys import MODE, PLANT_STATE, estimate
 from agent.contract.problem import Problem
 
 

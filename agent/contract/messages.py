@@ -1,28 +1,6 @@
-"""Every message and every key expression.
+"""Every message, as a model. Which key it is published under, by whom and for whom, is in `keys`.
 
-Data messages are flat JSON objects with a `step`; what is on the wire is what is recorded. Their keys are
-`peakmesh/<run>/<topic>`:
-
-| topic                  | model       | from                       | to                                         |
-|------------------------|-------------|----------------------------|--------------------------------------------|
-| mode                   | Mode        | coordinator                | nodes, plant, sensor drivers, recorder     |
-| plant/state            | PlantState  | plant                      | recorder                                   |
-| node/<n>/measurement   | Measurement | plant, or a sensor driver  | node n, recorder                           |
-| node/<n>/estimate      | Estimate    | node n                     | nodes that hear n in some mode, recorder   |
-| event                  | Event       | anyone                     | recorder, watchers                         |
-
-Keys that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<n>, coordinator or recorder:
-
-| key                    | what        | from                       | to                                         |
-|------------------------|-------------|----------------------------|--------------------------------------------|
-| alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
-| ready/<who>            | Ready       | everyone but sensors       | coordinator: it has seen all the others    |
-| control                | Control     | coordinator                | everyone: start, close, stop               |
-| acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
-| replay/<who>           | queryable   | publishers                 | recorder: their messages from a number on  |
-
-Every data message carries an attachment: its number among the sender's messages, the sender's clock, the
-sender's name (see `Stamp`). A sensor driver may leave it out.
+Data messages are flat JSON objects with a `step`; what is on the wire is what is recorded.
 """
 
 from __future__ import annotations
@@ -30,10 +8,7 @@ from __future__ import annotations
 import struct
 from typing import Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from agent.contract.errors import RunBroken, first_fault
-from agent.contract.problem import Problem
+from pydantic import BaseModel, ConfigDict, Field
 
 
 class Message(BaseModel):
@@ -157,86 +132,3 @@ class Stamp(NamedTuple):
 
 
 _STAMP = struct.Struct("<QQ")
-
-
-# topics: one table feeds roles, recorder and replay
-MODE, PLANT_STATE, EVENT = "mode", "plant/state", "event"
-
-
-def measurement(node: str) -> str:
-    return f"node/{node}/measurement"
-
-
-def estimate(node: str) -> str:
-    return f"node/{node}/estimate"
-
-
-def model_of(topic: str) -> type[Message] | None:
-    """The model of a topic's messages; None for a key that is not a topic."""
-    match topic.split("/"):
-        case ["mode"]:
-            return Mode
-        case ["plant", "state"]:
-            return PlantState
-        case ["node", _, "measurement"]:
-            return Measurement
-        case ["node", _, "estimate"]:
-            return Estimate
-        case ["event"]:
-            return Event
-    return None
-
-
-def decode(topic: str, payload: bytes) -> Message:
-    """A message of a known topic. Raises RunBroken: one sentence that says what came there."""
-    model = model_of(topic)
-    if model is None:
-        raise RunBroken(f"there is no topic {topic}")
-    try:
-        return model.decode(payload)
-    except ValidationError as error:
-        raise RunBroken(f"a message on {topic} is not a {model.__name__}: {first_fault(error, {})}") from None
-
-
-def key(run: str, topic: str) -> str:
-    return f"peakmesh/{run}/{topic}"
-
-
-def topic_of(key_expression: str) -> str:
-    """The inverse of `key`."""
-    return key_expression.split("/", 2)[2]
-
-
-def node_who(node: str) -> str:
-    return f"node-{node}"
-
-
-def sensor_who(node: str) -> str:
-    return f"sensor-{node}"
-
-
-COORDINATOR, PLANT, RECORDER = "coordinator", "plant", "recorder"
-CONTROL, ACKNOWLEDGED = "control", "acknowledged"
-
-
-def participants(problem: Problem) -> list[str]:
-    """Everybody who takes part in a run, but for sensors."""
-    return [COORDINATOR, PLANT, RECORDER, *map(node_who, problem.node_names)]
-
-
-def alive(who: str) -> str:
-    return f"alive/{who}"
-
-
-def ready(who: str) -> str:
-    return f"ready/{who}"
-
-
-def replay(who: str) -> str:
-    return f"replay/{who}"
-
-
-def in_words(who: str) -> str:
-    """`node "3"` for node-3, for people."""
-    kind, _, name = who.partition("-")
-    return f'{kind} "{name}"' if name else f"the {kind}"

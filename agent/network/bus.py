@@ -24,18 +24,8 @@ from typing import Self, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from agent.contract.errors import InputError, Interrupted, RunBroken, first_fault
-from agent.contract.messages import (
-    ACKNOWLEDGED,
-    CONTROL,
-    COORDINATOR,
-    RECORDER,
-    Acknowledged,
-    Control,
-    Message,
-    Ready,
-    in_words,
-    ready,
-)
+from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, RECORDER, in_words, model_of, ready
+from agent.contract.messages import Acknowledged, Control, Estimate, Message, Ready
 from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
@@ -90,7 +80,7 @@ class Bus:
         """Announce that these topics will be published, and offer replays of them."""
         self._session.offer_replay(self.who, self._outbox.since)
         for topic in topics:
-            express = topic.endswith("/estimate")  # the only message that somebody waits for right now
+            express = model_of(topic) is Estimate  # the only message that somebody waits for right now
             self._session.advertise(topic, express=express)
 
     def enter(self) -> None:

@@ -13,7 +13,8 @@ from typing import Any
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.messages import Stamp, alive, key, replay, topic_of
+from agent.contract.keys import alive, key, replay, topic_of
+from agent.contract.messages import Stamp
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
 from agent.network.words import ChannelClosed, Duty, Incoming, Peer, Replayed, Sample

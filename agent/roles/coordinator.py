@@ -13,17 +13,8 @@ from typing import Any, Literal, NamedTuple
 
 from agent.contract.errors import InputError, PeakmeshError, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import (
-    EVENT,
-    MODE,
-    Acknowledged,
-    Control,
-    Event,
-    Mode,
-    in_words,
-    participants,
-    sensor_who,
-)
+from agent.contract.keys import EVENT, MODE, in_words, participants, sensor_who
+from agent.contract.messages import Acknowledged, Control, Event, Mode
 from agent.contract.schedule import modes
 from agent.network.bus import Bus
 from agent.network.words import Peer

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import Control, participants
+from agent.contract.keys import participants
+from agent.contract.messages import Control
 from agent.network.bus import Bus
 from agent.network.words import ChannelClosed, RunClosed
 

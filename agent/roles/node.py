@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
-from agent.contract.messages import MODE, Control, Estimate, decode, estimate, measurement
+from agent.contract.keys import MODE, decode, estimate, measurement
+from agent.contract.messages import Control, Estimate
 from agent.contract.schedule import Deliveries
 from agent.filter import innovation, step
 from agent.inbox import Inbox

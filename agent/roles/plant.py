@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import MODE, PLANT_STATE, Control, Measurement, PlantState, decode, measurement
+from agent.contract.keys import MODE, PLANT_STATE, decode, measurement
+from agent.contract.messages import Control, Measurement, PlantState
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses

@@ -10,19 +10,8 @@ from pathlib import Path
 
 from agent.contract.errors import Interrupted, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.messages import (
-    COORDINATOR,
-    EVENT,
-    MODE,
-    PLANT,
-    PLANT_STATE,
-    Acknowledged,
-    Control,
-    decode,
-    estimate,
-    measurement,
-    node_who,
-)
+from agent.contract.keys import COORDINATOR, EVENT, MODE, PLANT, PLANT_STATE, decode, estimate, measurement, node_who
+from agent.contract.messages import Acknowledged, Control
 from agent.contract.recording import Logged
 from agent.contract.recording.writer import RecordingWriter, refuse_recording
 from agent.network.bus import Bus

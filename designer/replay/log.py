@@ -17,7 +17,8 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
-from agent.contract.messages import EVENT, MODE, PLANT_STATE, Event, estimate, measurement
+from agent.contract.keys import EVENT, MODE, PLANT_STATE, estimate, measurement
+from agent.contract.messages import Event
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
 from designer.replay.census import Census, take_census

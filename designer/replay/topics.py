@@ -11,20 +11,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from agent.contract.arrays import Array
-from agent.contract.messages import (
-    COORDINATOR,
-    MODE,
-    PLANT,
-    PLANT_STATE,
-    Estimate,
-    Measurement,
-    Message,
-    Mode,
-    PlantState,
-    estimate,
-    measurement,
-    node_who,
-)
+from agent.contract.keys import COORDINATOR, MODE, PLANT, PLANT_STATE, estimate, measurement, node_who
+from agent.contract.messages import Estimate, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from made_recordings import observer_gains, random_gains, random_problem, real_problem, simulate
 
 from agent.contract.gains import Gains
-from agent.contract.messages import Estimate, Measurement, Message, Mode, model_of
+from agent.contract.keys import model_of
+from agent.contract.messages import Estimate, Measurement, Message, Mode
 from agent.filter import step
 from agent.inbox import Inbox
 

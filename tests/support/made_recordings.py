@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agent.contract import messages, schedule
+from agent.contract import keys, schedule
 from agent.contract.files import canonical
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
@@ -178,22 +178,22 @@ def simulate(
     x, mode = np.zeros(problem.nx), ""
     x_hat = {name: np.zeros(problem.nx) for name in problem.node_names}
     heard: dict[str, list[str]] = {name: [] for name in problem.node_names}
-    sent.add("event", messages.COORDINATOR, step=0, kind="start", who="coordinator", detail="")
+    sent.add("event", keys.COORDINATOR, step=0, kind="start", who="coordinator", detail="")
     for k in range(steps):
         w, theta = source.at(k), losses.at(k)
         if nudge is not None and nudge[0] == k:
             x_hat[nudge[1]] = x_hat[nudge[1]] + nudge[2]
         arrived = [int(arrives) for arrives in theta]
-        sent.add("plant/state", messages.PLANT, step=k, x=x, z=M @ x, w=w, arrived=arrived)
+        sent.add("plant/state", keys.PLANT, step=k, x=x, z=M @ x, w=w, arrived=arrived)
         innovation = {}
         for node, theta_i in zip(problem.nodes, theta, strict=True):
             y = theta_i * (node.C @ x) + node.D @ w
-            who = messages.PLANT
+            who = keys.PLANT
             if node.seen and not theta_i:
                 y = np.empty(0)
             if node.name in real:
-                y, who = np.asarray(real[node.name][k]), messages.sensor_who(node.name)
-            sent.add(messages.measurement(node.name), who, step=k, y=y)
+                y, who = np.asarray(real[node.name][k]), keys.sensor_who(node.name)
+            sent.add(keys.measurement(node.name), who, step=k, y=y)
             x_hat_i = x_hat[node.name]
             if (k, node.name) in peeks:
                 assert not len(y), "nothing was lost"
@@ -203,8 +203,8 @@ def simulate(
             else:
                 innovation[node.name] = y - node.C @ x_hat_i if len(y) else np.zeros(len(node.C))
             sent.add(
-                messages.estimate(node.name),
-                messages.node_who(node.name),
+                keys.estimate(node.name),
+                keys.node_who(node.name),
                 step=k,
                 x_hat=x_hat_i,
                 innovation=innovation[node.name],
@@ -214,7 +214,7 @@ def simulate(
             )
         s = next(chain)
         mode = problem.mode_names[s]
-        sent.add("mode", messages.COORDINATOR, step=k, mode=mode)
+        sent.add("mode", keys.COORDINATOR, step=k, mode=mode)
         before, x = x_hat, A @ x + B @ w
         phi, x_hat = deliveries.at(k), {}
         for i, name in enumerate(problem.node_names):
@@ -232,7 +232,7 @@ def simulate(
                     x_hat[name] += A @ own + a_ij * H_ij @ nu_j
                 else:
                     x_hat[name] += a_ij * (K_ij @ (x_hat_j if forgets_itself else x_hat_j - own) + H_ij @ nu_j)
-    sent.add("event", messages.COORDINATOR, step=max(steps - 1, 0), kind="end", who="coordinator", detail="")
+    sent.add("event", keys.COORDINATOR, step=max(steps - 1, 0), kind="end", who="coordinator", detail="")
     return sent.messages
 
 

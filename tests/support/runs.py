@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from agent.contract.messages import Message, model_of
+from agent.contract.keys import model_of
+from agent.contract.messages import Message
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
 

@@ -16,8 +16,8 @@ from mcap.writer import CompressionType, Writer
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.files import refuse_overwrite
 from agent.contract.gains import Gains
+from agent.contract.keys import model_of
 from agent.contract.layout import foxglove_layout
-from agent.contract.messages import model_of
 from agent.contract.recording import FORMAT, VERSION, Logged
 
 CHUNK_SIZE = 256 * 1024

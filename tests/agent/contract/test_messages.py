@@ -1,8 +1,7 @@
-"""Messages are exact, flat and finite; keys, topics and the table that documents them are one."""
+"""Messages are exact, flat and finite."""
 
 from __future__ import annotations
 
-import re
 import struct
 from typing import Any
 
@@ -11,37 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from agent.contract import messages
-from agent.contract.gains import Gains
-from agent.contract.messages import (
-    ACKNOWLEDGED,
-    CONTROL,
-    COORDINATOR,
-    EVENT,
-    MODE,
-    PLANT,
-    PLANT_STATE,
-    RECORDER,
-    Estimate,
-    Event,
-    Measurement,
-    Message,
-    Mode,
-    PlantState,
-    Stamp,
-    alive,
-    estimate,
-    in_words,
-    key,
-    measurement,
-    model_of,
-    node_who,
-    participants,
-    ready,
-    replay,
-    sensor_who,
-    topic_of,
-)
+from agent.contract.keys import node_who
+from agent.contract.messages import Estimate, Event, Measurement, Message, Mode, PlantState, Stamp
 
 MODELS = (Mode, PlantState, Measurement, Estimate, Event)
 EXAMPLES: tuple[Message, ...] = (
@@ -130,56 +100,6 @@ def test_schemas_are_flat(model: type[Message]) -> None:
             assert field["items"]["type"] in {"number", "integer", "string"}
         else:
             assert field["type"] in {"integer", "string"}
-
-
-# keys and topics
-@given(NAMES, NAMES)
-def test_a_topic_is_the_inverse_of_its_key(run: str, node: str) -> None:
-    for topic in (MODE, PLANT_STATE, EVENT, measurement(node), estimate(node)):
-        assert topic_of(key(run, topic)) == topic
-        assert key(run, topic).split("/")[:2] == ["peakmesh", run]
-
-
-@given(NAMES)
-def test_every_topic_has_one_model(node: str) -> None:
-    models = [model_of(topic) for topic in (MODE, PLANT_STATE, measurement(node), estimate(node), EVENT)]
-    assert models == [Mode, PlantState, Measurement, Estimate, Event]
-
-
-@pytest.mark.parametrize(
-    "topic", ["", "modes", "plant", "plant/states", "node/1", "node/1/x", "node/a/b/estimate", CONTROL, ACKNOWLEDGED]
-)
-def test_what_is_no_topic_has_no_model(topic: str) -> None:
-    assert model_of(topic) is None
-
-
-@given(NAMES)
-def test_participants_are_named_in_words(node: str) -> None:
-    assert in_words(node_who(node)) == f'node "{node}"'
-    assert in_words(sensor_who(node)) == f'sensor "{node}"'
-    assert [in_words(who) for who in (COORDINATOR, PLANT, RECORDER)] == ["the coordinator", "the plant", "the recorder"]
-
-
-def test_everybody_takes_part_once(gains: Gains) -> None:
-    everybody = participants(gains.problem)
-    assert everybody == ["coordinator", "plant", "recorder", "node-n0", "node-n1", "node-n2"]
-
-
-def test_the_table_names_every_key_of_the_code() -> None:
-    """The docstring's tables have one row for each topic and each key, under the model the code gives it."""
-    rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in re.findall(r"^\|.*\|$", messages.__doc__, re.M)]
-    table = dict(row for row in rows if not row[0].startswith("-") and row[0] not in {"topic", "key"})
-    topics = {
-        topic: model_of(topic).__name__ for topic in (MODE, PLANT_STATE, EVENT, measurement("<n>"), estimate("<n>"))
-    }
-    keys = {
-        alive("<who>"): "liveliness",
-        ready("<who>"): "Ready",
-        CONTROL: "Control",
-        ACKNOWLEDGED: "Acknowledged",
-        replay("<who>"): "queryable",
-    }
-    assert table == topics | keys
 
 
 # stamps

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
-from agent.contract.messages import CONTROL, COORDINATOR, MODE, PLANT, RECORDER, Acknowledged, Control, Mode
+from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
+from agent.contract.messages import Acknowledged, Control, Mode
 from agent.network.bus import Bus
 from agent.network.configuration import Network
 from agent.network.words import Peer, RunClosed, Sample

@@ -1,0 +1,120 @@
+"""Every key expression: who says what to whom. One table for the runtime, the recorder and the replay.
+
+Keys are `peakmesh/<run>/<topic>`. Messages of the data topics are recorded as they were on the wire:
+
+| topic                  | model       | from                       | to                                         |
+|------------------------|-------------|----------------------------|--------------------------------------------|
+| mode                   | Mode        | coordinator                | nodes, plant, sensor drivers, recorder     |
+| plant/state            | PlantState  | plant                      | recorder                                   |
+| node/<n>/measurement   | Measurement | plant, or a sensor driver  | node n, recorder                           |
+| node/<n>/estimate      | Estimate    | node n                     | nodes that hear n in some mode, recorder   |
+| event                  | Event       | anyone                     | recorder, watchers                         |
+
+Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<n>, coordinator or recorder:
+
+| topic                  | what        | from                       | to                                         |
+|------------------------|-------------|----------------------------|--------------------------------------------|
+| alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
+| ready/<who>            | Ready       | everyone but sensors       | coordinator: it has seen all the others    |
+| control                | Control     | coordinator                | everyone: start, close, stop               |
+| acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
+| replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
+
+The models are in `messages`. Every data message carries an attachment: its number among the sender's messages, the
+sender's clock, the sender's name (`messages.Stamp`). A sensor driver may leave it out.
+"""
+
+from __future__ import annotations
+
+from pydantic import ValidationError
+
+from agent.contract.errors import RunBroken, first_fault
+from agent.contract.messages import Estimate, Event, Measurement, Message, Mode, PlantState
+from agent.contract.problem import Problem
+
+
+def key(run: str, topic: str) -> str:
+    return f"peakmesh/{run}/{topic}"
+
+
+def topic_of(key_expression: str) -> str:
+    """The inverse of `key`."""
+    return key_expression.split("/", 2)[2]
+
+
+# data
+MODE, PLANT_STATE, EVENT = "mode", "plant/state", "event"
+
+
+def measurement(node: str) -> str:
+    return f"node/{node}/measurement"
+
+
+def estimate(node: str) -> str:
+    return f"node/{node}/estimate"
+
+
+def model_of(topic: str) -> type[Message] | None:
+    """The model of a topic's messages; None for a key that is not a topic."""
+    match topic.split("/"):
+        case ["mode"]:
+            return Mode
+        case ["plant", "state"]:
+            return PlantState
+        case ["node", _, "measurement"]:
+            return Measurement
+        case ["node", _, "estimate"]:
+            return Estimate
+        case ["event"]:
+            return Event
+    return None
+
+
+def decode(topic: str, payload: bytes) -> Message:
+    """A message of a known topic. Raises RunBroken: one sentence that says what came there."""
+    model = model_of(topic)
+    if model is None:
+        raise RunBroken(f"there is no topic {topic}")
+    try:
+        return model.decode(payload)
+    except ValidationError as error:
+        raise RunBroken(f"a message on {topic} is not a {model.__name__}: {first_fault(error, {})}") from None
+
+
+# what runs the run
+CONTROL, ACKNOWLEDGED = "control", "acknowledged"
+
+
+def alive(who: str) -> str:
+    return f"alive/{who}"
+
+
+def ready(who: str) -> str:
+    return f"ready/{who}"
+
+
+def replay(who: str) -> str:
+    return f"replay/{who}"
+
+
+# who there is
+COORDINATOR, PLANT, RECORDER = "coordinator", "plant", "recorder"
+
+
+def node_who(node: str) -> str:
+    return f"node-{node}"
+
+
+def sensor_who(node: str) -> str:
+    return f"sensor-{node}"
+
+
+def participants(problem: Problem) -> list[str]:
+    """Everybody who takes part in a run, but for sensors."""
+    return [COORDINATOR, PLANT, RECORDER, *map(node_who, problem.node_names)]
+
+
+def in_words(who: str) -> str:
+    """`node "3"` for node-3, for people."""
+    kind, _, name = who.partition("-")
+    return f'{kind} "{name}"' if name else f"the {kind}"
