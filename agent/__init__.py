@@ -1,1 +1,8 @@
-"""The runtime of peakmesh: what runs on a device. Imports numpy, zenoh, pydantic; mcap only in the recorder."""
+"""The runtime of peakmesh: what runs on a device. Imports numpy, zenoh, pydantic; mcap only in the recorder.
+
+the rooms       contract: what both packages share, files, keys and messages; network: a participant's place on it;
+                roles: node, plant, coordinator, recorder; commands: what the program does
+a node's step   inbox: what must be there before it; filter: eqs. (4) and (5)
+a whole run     plan: what the coordinator decides; receipts: what the recorder has; launch: every role on this machine
+the machine     cli: the program
+"""

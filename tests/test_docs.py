@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from places import ROOT
 
+import agent
 import designer
 
 DOCUMENTS = {path.name: path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
@@ -69,11 +71,12 @@ def test_sections_that_are_referred_to_exist() -> None:
     assert {number for found in [*elsewhere, *within] for number in found.split(" to ")} <= numbers
 
 
-def test_the_map_of_the_designer_has_every_module() -> None:
+@pytest.mark.parametrize("package", [agent, designer], ids=lambda package: package.__name__)
+def test_the_map_of_a_package_has_every_module(package: ModuleType) -> None:
     """And no other."""
-    files = Path(designer.__file__).parent.iterdir()
+    files = Path(package.__path__[0]).iterdir()
     modules = {path.stem for path in files if path.suffix == ".py" or (path / "__init__.py").exists()}
-    text = (designer.__doc__ or "").partition("\n\n")[2]
+    text = (package.__doc__ or "").partition("\n\n")[2]
     named = {word for line in text.splitlines() for word in re.findall(r"\w+", line[16:])}
     assert modules - {"__init__", "__main__"} <= named
     known = re.findall(r"(?:^|; |, )(?:and )?(\w+):", "\n".join(line[16:] for line in text.splitlines()), re.MULTILINE)
