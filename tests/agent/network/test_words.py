@@ -39,11 +39,12 @@ def test_what_a_duty_raises_is_raised_where_it_is_taken() -> None:
 
 def test_what_was_set_aside_comes_first_or_when_its_kind_is_asked_for() -> None:
     words = filled(Replayed("node-1"))
-    for word in (Peer("plant", present=True), READY):
+    come, gone = Peer("plant", present=True), Peer("plant", present=False)
+    for word in (come, READY, gone):
         words.set_aside(word)
     assert words.early(Ready) is READY
     assert words.early(Ready) is None
-    assert [words.next(math.inf) for _ in range(2)] == [Peer("plant", present=True), Replayed("node-1")]
+    assert [words.next(math.inf) for _ in range(3)] == [come, gone, Replayed("node-1")]
 
 
 def test_who_is_present_follows_the_tokens() -> None:
