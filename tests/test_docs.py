@@ -16,7 +16,7 @@ import designer
 DOCUMENTS = {path.name: path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
 FILES = {
     path.relative_to(ROOT).as_posix(): path.read_text()
-    for folder in ("agent", "designer", "benchmarks", "docs")
+    for folder in ("agent", "designer", "benchmarks", "docs", "tests")
     for path in (ROOT / folder).rglob("*.py")
 }
 
