@@ -6,27 +6,21 @@ import sys
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 
 from agent.contract.errors import counted, shortened
 from agent.contract.files import canonical, digest
+from agent.contract.frozen import Frozen
 
 Array = NDArray[np.float64]
 Number = Annotated[float, Field(strict=True)]  # neither "0.5" nor true is a number
 
 
-class Model(BaseModel):
-    """Frozen, and strict about keys: an unknown one is refused, never ignored."""
+class Model(Frozen):
+    """Strict about keys: an unknown one is refused, never ignored."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
-
-    def document(self) -> Any:
-        """The model as plain lists, dicts, strings and numbers, under the names used in files.
-
-        What is None is left out, so that the digest of a file stays what it is when a later version knows more.
-        """
-        return self.model_dump(by_alias=True, exclude_none=True)
+    model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False)
 
     def canonical(self) -> bytes:
         """Canonical JSON: equal models have equal bytes, float64 bit for bit."""
@@ -43,7 +37,7 @@ class Model(BaseModel):
         return hash(self.canonical())
 
 
-def read_only(values: Array) -> Array:
+def read_only(values: ArrayLike) -> Array:
     """A contiguous float64 copy that refuses to be written to."""
     copy = np.array(values, dtype=np.float64, order="C")
     copy.flags.writeable = False

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
-from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.errors import InputError, listed
 from agent.contract.files import kind_of, read_bytes, write_whole
 from agent.contract.problem import Problem
 
@@ -93,9 +93,9 @@ class Gains(Model):
                 "design the gains again"
             )
         try:
-            return cls.model_validate(document)
-        except ValidationError as error:
-            raise InputError(f"{source}: {first_fault(error, document)}") from None
+            return cls.from_document(document)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
 
     def save(self, path: Path, *, force: bool = False) -> None:
         """Write canonical JSON, whole or not at all."""

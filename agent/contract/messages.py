@@ -8,13 +8,15 @@ from __future__ import annotations
 import struct
 from typing import Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
+
+from agent.contract.frozen import Frozen
 
 
-class Message(BaseModel):
-    """Flat, frozen, finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
+class Message(Frozen):
+    """Flat and finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
     step: int = Field(ge=0, lt=2**63)
 
@@ -72,7 +74,7 @@ class Event(Message):
     detail: str
 
 
-class Ready(BaseModel):
+class Ready(Frozen):
     """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains."""
 
     who: str
@@ -80,7 +82,7 @@ class Ready(BaseModel):
     gains: str
 
 
-class Control(BaseModel):
+class Control(Frozen):
     """The coordinator's word.
 
     "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`.
@@ -95,7 +97,7 @@ class Control(BaseModel):
     reason: str
 
 
-class Acknowledged(BaseModel):
+class Acknowledged(Frozen):
     """The recorder's word: it holds the first `received[who]` messages of everyone, and every step < `steps`.
 
     `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of

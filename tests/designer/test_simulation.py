@@ -32,6 +32,7 @@ from places import ROOT
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
+from agent.contract.files import canonical
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer import simulation
@@ -453,7 +454,7 @@ def test_gains_that_lack_the_worst_case_are_refused(tmp_path: Path, capsys: pyte
 
 def test_a_worst_case_for_another_number_of_disturbances_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gains.json"
-    worst_gains().model_copy(update={"worst_case": np.ones((4, 5))}).save(path)
+    path.write_bytes(canonical(worst_gains().document() | {"worst_case": [[1.0] * 5] * 4}))
     with pytest.raises(InputError, match="worst_case is 4 x 5; it needs a column for each disturbance of the plant, 2"):
         Gains.load(path)
 

@@ -160,6 +160,7 @@ def simulate(
     says: Mapping[tuple[int, str, str], bool] | None = None,
     peeks: Container[tuple[int, str]] = (),
     forgets_itself: bool = False,
+    misjudges_itself: Mapping[str, float] | None = None,
 ) -> list[Sent]:
     """Every message of a lock-step run.
 
@@ -168,7 +169,8 @@ def simulate(
 
     Misdeeds: `uses` (step, receiver, sender) decides over a message in place of the seed, `says` what the receiver
     tells of it. At (step, node) of `peeks` a node uses the measurement that it lost. Where the gains are unbiased,
-    a node that `forgets_itself` draws nothing from x_hat_j - x_hat_i, but takes x_hat_j.
+    a node that `forgets_itself` draws nothing from x_hat_j - x_hat_i, but takes x_hat_j; one that `misjudges_itself`
+    has a K_ii that is off by that share.
     """
     problem, real = gains.problem, real_y or {}
     A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
@@ -229,7 +231,8 @@ def simulate(
                 if not problem.unbiased:
                     x_hat[name] += a_ij * (K_ij @ x_hat_j + H_ij @ nu_j)
                 elif j == name:
-                    x_hat[name] += A @ own + a_ij * H_ij @ nu_j
+                    off = (misjudges_itself or {}).get(name, 0.0) * K_ij
+                    x_hat[name] += A @ own + a_ij * (off @ own + H_ij @ nu_j)
                 else:
                     x_hat[name] += a_ij * (K_ij @ (x_hat_j if forgets_itself else x_hat_j - own) + H_ij @ nu_j)
     sent.add("event", keys.COORDINATOR, step=max(steps - 1, 0), kind="end", who="coordinator", detail="")

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from agent.contract.arrays import Array, Model
-from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.arrays import Array, Model, read_only
+from agent.contract.errors import InputError, listed
 from agent.contract.problem import consistency, file
 from agent.contract.problem.disturbance import Disturbance, Quiet
 from agent.contract.problem.parts import LossyLink, MarkovChain, Name, Node, Plant, Topology
@@ -43,14 +43,6 @@ class Problem(Model):
             return cls.from_document(document)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-
-    @classmethod
-    def from_document(cls, document: Any) -> Self:
-        """A problem from plain dicts and lists, as they stand in problem.toml or gains.json."""
-        try:
-            return cls.model_validate(document)
-        except ValidationError as error:
-            raise InputError(first_fault(error, document)) from None
 
     @model_validator(mode="before")
     @classmethod
@@ -106,7 +98,7 @@ class Problem(Model):
     @cached_property
     def beta(self) -> Array:
         """Arrival probabilities, (n,)."""
-        return np.array([node.arrival_probability for node in self.nodes])
+        return read_only([node.arrival_probability for node in self.nodes])
 
     @cached_property
     def delivery(self) -> Array:
@@ -114,7 +106,7 @@ class Problem(Model):
         rho = np.ones((self.n, self.n))
         for link in self.links or ():
             rho[self.node_names.index(link.receiver), self.node_names.index(link.sender)] = link.delivery_probability
-        return rho
+        return read_only(rho)
 
     @property
     def carries_plant(self) -> bool:
