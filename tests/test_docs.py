@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from types import ModuleType
 
@@ -12,8 +15,10 @@ from places import ROOT
 
 import agent
 import designer
+from designer.cli import main
 
-DOCUMENTS = {path.name: path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]}
+DOCUMENTS = {path.name: path.read_text() for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]}
+DOCUMENTS["recordings/README.md"] = (ROOT / "recordings" / "README.md").read_text()
 FILES = {
     path.relative_to(ROOT).as_posix(): path.read_text()
     for folder in ("agent", "designer", "benchmarks", "docs", "tests")
@@ -53,6 +58,31 @@ def test_names_of_the_code_exist(document: str) -> None:
     assert [name for name in named if not exists(name)] == []
     files = re.findall(r"`(?:python )?([\w/]+\.py)\b", DOCUMENTS[document])
     assert [name for name in files if not any(f"/{path}".endswith(f"/{name}") for path in FILES)] == []
+
+
+def unknown(command: str, rest: str) -> list[str]:
+    """The command, or those of its options, that the program does not know."""
+    with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()), pytest.raises(SystemExit) as caught:
+        main([command, "--help"])
+    known = re.findall(r"--[\w-]+", said.getvalue())
+    return (
+        [option for option in re.findall(r"--[\w-]+", rest) if option not in known]
+        if not caught.value.code
+        else [command]
+    )
+
+
+@pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md", "recordings/README.md"])
+def test_commands_exist(document: str) -> None:
+    """Every `peakmesh COMMAND --option` and every `.ci/script`."""
+    found = re.findall(r"(?:`|^ *(?:\S*/)?)peakmesh (\w+)([^`\n#]*)", DOCUMENTS[document], flags=re.MULTILINE)
+    assert len(found) > 1
+    assert [part for command, rest in found for part in unknown(command, rest)] == []
+    assert unknown("design", "--force --without-nodes 1") == ["--without-nodes"]
+    assert unknown("desing", "") == ["desing"]
+    assert [
+        script for script in re.findall(r"\.ci/\w+", DOCUMENTS[document]) if not os.access(ROOT / script, os.X_OK)
+    ] == []
 
 
 def sections(document: str) -> set[str]:
