@@ -29,6 +29,7 @@ from designer.replay.gamma import checked_gamma
 from designer.replay.inputs import draw, logged_inputs, logged_states
 from designer.replay.log import Log, load
 from designer.replay.proofs import Check
+from designer.replay.trace import Trace
 from designer.replay.verdict import Divergence, Peak, Proof, Verdict
 
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
@@ -71,9 +72,13 @@ def tolerance(problem: Problem) -> float:
 
 def replay(path: FilePath) -> Verdict:
     """Read a recording and judge it. Raises InputError for a file that is no recording."""
-    log = load(path)
+    return judge(load(path))
+
+
+def judge(log: Log, trace: Trace | None = None) -> Verdict:
+    """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
     central = Central.of(log.gains)
-    tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names)
+    tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names, trace)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
         audit = _compare(log, central, tally)
     return _verdict(log, tally, audit)
@@ -82,8 +87,8 @@ def replay(path: FilePath) -> Verdict:
 class Tally:
     """The worst gap of each proof, and the first divergence: by step, then in the order of the checks."""
 
-    def __init__(self, tolerance: float, node_names: tuple[str, ...]) -> None:
-        self.tolerance, self._names = tolerance, node_names
+    def __init__(self, tolerance: float, node_names: tuple[str, ...], trace: Trace | None = None) -> None:
+        self.tolerance, self.trace, self._names = tolerance, trace, node_names
         self.compared = dict.fromkeys((1, 2, 3), 0)
         self.gaps = dict.fromkeys((1, 2, 3), 0.0)
         self.worst: Divergence | None = None
@@ -94,6 +99,8 @@ class Tally:
             known = ~np.isnan(check.gap)
             if not known.any():
                 continue
+            if self.trace is not None:
+                self.trace.add(check)
             gap = np.where(known, check.gap, -1.0)
             self.compared[check.proof] += int(known.sum())
             self.gaps[check.proof] = max(self.gaps[check.proof], float(gap.max()))
@@ -169,12 +176,17 @@ def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float
     whole = free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
+    if tally.trace is not None and log.has_plant:
+        tally.trace.energy_before[:] = energy_before
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
     audit, errors = PathAudit(log.gains.problem.nw), log.error_norms()
     for part in free_run.free_run(log, central, whole, block=block):
         tally.add([free_run.free_check(log, central, part)])
         if log.has_plant:
-            audit.add(free_run.path_block(central, part, errors, energy_before), tally.tolerance)
+            path = free_run.path_block(central, part, errors, energy_before)
+            audit.add(path, tally.tolerance)
+            if tally.trace is not None:
+                tally.trace.path_bound[path.first : path.first + len(path.bound)] = path.bound
     return (audit, float(energies.sum())) if log.has_plant else None
 
 
