@@ -15,7 +15,7 @@ from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
 from designer.commands.design import add_method, design_and_save, design_text
-from designer.commands.recordings import write_pictures
+from designer.commands.report import write_pictures
 
 
 def add_demo(commands: Subcommands) -> None:
