@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from agent.contract.gains import Gains
 from designer.lmi import beyond_paper
 
+FLOOR, EXACT, CERTIFIED = "floor", "exact gain of these gains", "gamma, certified"
 _NOTHING = 1e-6  # a floor this small beside the gain says nothing
 
 
@@ -43,29 +44,36 @@ class Ladder(NamedTuple):
         """The rungs and both distances, for --json."""
         return {**self._asdict(), "against_theorem2": self.against_theorem2, "above_floor": self.above_floor}
 
+    def rungs(self) -> list[tuple[str, float]]:
+        """What every rung is called, and its value, the lowest first; without those that were not computed."""
+        rungs = [
+            (FLOOR, self.floor),
+            (EXACT, self.exact and self.exact[1]),
+            (CERTIFIED, self.gamma),
+            (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
+            (f"{self.lmi}'s bound", self.theorem2),
+        ]
+        return [(name, value) for name, value in rungs if value is not None]
+
     def lines(self) -> list[str]:
         """A line for each rung, the lowest first."""
-        rungs = [
-            (self.floor, "floor"),
-            (self.exact and self.exact[1], "exact gain of these gains"),
-            (self.gamma, "gamma, certified"),
-            (self.theorem2_exact and self.theorem2_exact[1], f"exact gain of {self.lmi}'s gains"),
-            (self.theorem2, f"{self.lmi}'s bound"),
-        ]
         remarks = []
         if self.against_theorem2 is not None:
             remarks.append(f"{percent(self.against_theorem2)} against {self.lmi}'s bound")
         if self.above_floor is not None:
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
-        at = 1 if self.exact is not None else 2
-        rungs[at] = rungs[at][0], ": ".join([rungs[at][1], *([", ".join(remarks)] if remarks else [])])
-        there = [(value, name) for value, name in rungs if value is not None]
-        texts = [(f"{value:.6f}" if name == "floor" else rounded_up(value), name) for value, name in there]
+        remarked = {CERTIFIED if self.exact is None else EXACT: ": ".join(["", ", ".join(remarks)] if remarks else [])}
+        texts = [(rung_text(name, value), name + remarked.get(name, "")) for name, value in self.rungs()]
         width = max((len(value) for value, _ in texts), default=0)
         lines = [f"{value:{width}}  {name}" for value, name in texts]
         if self.exact is None and self.gamma is not None:
-            lines.append(f"{'-':{width}}  exact gain of these gains: not computed for so large a network; analyse does")
+            lines.append(f"{'-':{width}}  {EXACT}: not computed for so large a network; analyse does")
         return lines
+
+
+def rung_text(name: str, value: float) -> str:
+    """A rung's value: rounded up, but for the floor, which is a bound from below."""
+    return f"{value:.6f}" if name == FLOOR else rounded_up(value)
 
 
 def ladder_of(gains: Gains) -> Ladder:

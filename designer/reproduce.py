@@ -95,9 +95,10 @@ _FOUND = ("theorem2_exact", "consensus", "least_variance", "exact")  # the rows 
 
 
 class Reproduced(NamedTuple):
-    """values[example][row key]."""
+    """values[example][row key], and what they were computed from."""
 
     values: dict[str, dict[str, float | None]]
+    computed: dict[str, Computed]
 
     def document(self) -> dict[str, Any]:
         """For --json."""
@@ -161,11 +162,11 @@ def reproduce(
 ) -> Reproduced:
     """Compute the rows (None: all) for the examples, built-in problems; `report` gets each value as it is there."""
     values: dict[str, dict[str, float | None]] = {}
+    computed = {name: Computed(find(name)) for name in examples}
     for name in examples:
-        computed = Computed(find(name))
         values[name] = {}
         for row in ROWS:
             if rows is None or row.key in rows:
-                value = values[name][row.key] = row.value(computed)
+                value = values[name][row.key] = row.value(computed[name])
                 report(f"{name}: {row.text}: {Reproduced.cell(value, row.key)}")
-    return Reproduced(values)
+    return Reproduced(values, computed)

@@ -1,13 +1,19 @@
-"""`peakmesh reproduce`: the paper's table, printed beside computed."""
+"""`peakmesh reproduce`: the paper's table, printed beside computed, and its figures."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD
+from designer.commands.report import FORMATS, add_figures, refuse_lone_options
+
+if TYPE_CHECKING:
+    from designer.reproduce import Reproduced
 
 
 def add_reproduce(commands: Subcommands) -> None:
@@ -15,13 +21,29 @@ def add_reproduce(commands: Subcommands) -> None:
     reproduce = add_command(
         commands, "reproduce", reproduce_command, "the paper's two examples: printed beside computed (a minute or two)"
     )
+    add_figures(reproduce, "write the paper's figures 2 to 6 into this folder, of a run with Theorem 2's gains")
+    reproduce.add_argument("--force", action="store_true", help="replace figures that exist")
     reproduce.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def reproduce_command(options: argparse.Namespace) -> int:
     """`peakmesh reproduce`."""
+    refuse_lone_options(options)
     from designer.reproduce import reproduce
 
     table = reproduce(report=lambda said: print(said, file=sys.stderr))
-    print(json.dumps(table.document()) if options.json else table.text())
+    figures = [] if options.figures is None else [str(path) for path in _write_figures(table, options)]
+    if options.json:
+        print(json.dumps(table.document() | {"figures": figures}))
+    else:
+        print("\n".join([table.text(), *([f"\n{len(figures)} figures in {options.figures}"] if figures else [])]))
     return EXIT_GOOD
+
+
+def _write_figures(table: Reproduced, options: argparse.Namespace) -> list[Path]:
+    from designer.report import figures, paper
+
+    charts = paper.charts({name: table.computed[name].theorem2 for name in paper.EXAMPLES})
+    options.figures.mkdir(parents=True, exist_ok=True)
+    drawings = figures.drawings(charts, stop=paper.STEPS)
+    return figures.write(drawings, options.figures, kind=options.format or FORMATS[0], force=options.force)

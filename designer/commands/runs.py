@@ -15,12 +15,12 @@ from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
 from designer.commands.design import add_method, design_and_save, design_text
-from designer.commands.report import write_pictures
+from designer.commands.report import write_page
 
 
 def add_demo(commands: Subcommands) -> None:
     """Describe `demo` to the parser."""
-    demo = add_command(commands, "demo", demo_command, "design, run, replay and picture an example (zhu2020-lossy)")
+    demo = add_command(commands, "demo", demo_command, "design, run, replay and report an example (zhu2020-lossy)")
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
     add_method(demo)
     agent.commands.run.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
@@ -29,7 +29,7 @@ def add_demo(commands: Subcommands) -> None:
 def demo_command(options: argparse.Namespace) -> int:
     """`peakmesh demo`: the whole job; its files go to a folder of their own."""
     from designer.problems import find
-    from designer.replay import replay
+    from designer.report.account import Account
 
     problem = find(options.problem)
     folder = options.output or Path("recordings") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
@@ -37,20 +37,22 @@ def demo_command(options: argparse.Namespace) -> int:
         raise InputError(f"{folder} is a file; --output takes the folder for the demo's files")
     folder.mkdir(parents=True, exist_ok=True)
     gains_path, options.output = folder / "gains.json", folder / "run.mcap"
-    for path in (gains_path, options.output):
+    page = folder / "report.html"
+    for path in (gains_path, options.output, page):
         refuse_overwrite(path, force=options.force)
 
     gains, designed = design_and_save(problem, options.method, gains_path, force=options.force)
     _say(options, f"1. design\n{design_text(designed)}")
     ran = agent.commands.run.run_gains(gains_path, gains, options)
     _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{run_text(ran)}")
-    verdict = replay(options.output)
-    _say(options, f"\n3. replay\n{verdict.text()}")
-    pictures = write_pictures(options.output, folder, force=options.force)
-    _say(options, "\n4. pictures\n" + "\n".join(pictures))
+    account = Account.of(options.output)
+    _say(options, f"\n3. replay\n{account.verdict.text()}")
+    write_page(account, page, force=options.force)
+    _say(options, f"\n4. report\n{page}")
     if options.json:
-        print(json.dumps({"design": designed, "run": ran, "replay": verdict.document(), "pictures": pictures}))
-    return verdict.exit_code
+        done = {"design": designed, "run": ran, "replay": account.verdict.document(), "report": str(page)}
+        print(json.dumps(done))
+    return account.verdict.exit_code
 
 
 def _say(options: argparse.Namespace, text: str) -> None:

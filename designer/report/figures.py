@@ -1,269 +1,248 @@
-"""Pictures of a recording, in the arrangement of Zhu et al. 2020.
-
-`outputs_figure` is their figures 3 and 4, z with every z_hat_i, over their figure 2, the modes; `errors_figure` is
-their figures 5 and 6, the output error of every node, over the norm of all errors together, which gamma is about.
-"""
+"""The pictures of a report for a paper: at the width of one column or of two, as PDF, SVG or PNG."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
-from itertools import cycle, islice
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.colors import ListedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.patches import Circle, PathPatch, Polygon
+from matplotlib.path import Path as Curve
 
-from agent.contract.arrays import Array
 from agent.contract.files import refuse_overwrite, write_whole
-from designer.ladder import rounded_up
-from designer.replay.gamma import checked_gamma
-from designer.replay.log import Log, load
+from agent.contract.problem import Problem
+from designer.ladder import rung_text
+from designer.report import graphs
+from designer.report.chart import LOOKS, Band, Chart, Level, Line, Map, Raster, extremes
+from designer.report.colours import ramp
+from designer.report.scales import Columns, columns, step_ticks
 
-# Okabe and Ito 2008, told apart by readers of every colour vision; black is kept for the plant
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-MARKERS = "os^Dv<>p"  # hollow, so that nodes whose curves coincide are all seen
-MARKED = 40  # markers on a line at most; where there are more steps, every node has its own
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # tell apart the nodes that share a colour
-BLACK, GREY, PALE = "#1a1a1a", "#707070", "#d9d9d9"
-WIDTH = 7.0  # inches: a page's text
-POINTS = 4000  # of a line; a longer one keeps the extremes of every stretch
-STAIRS = 600  # steps up to which a staircase can be read
-STRETCHES = 150
-RASTER_ABOVE = 20  # lines: more would make an SVG of many megabytes
-SETTLED = 0.01  # of the largest value: what stays below it to the end is not shown
+WIDTHS = {"one-column": 3.5, "two-columns": 7.16}  # inches: what IEEE journals take, and others near enough
+DPI = 600
+MOST_COLUMNS = 2000
+HEIGHT = 2.0  # inches, of a picture of lines
+FINE = 30  # columns an inch above which lines are thinner
+DOTTED = 80  # columns up to which there are dots
+INK, SOFT, GRID = "#1a1a1a", "#595959", "#e3e3e3"
 STYLE = {
     "font.family": "DejaVu Sans",
-    "font.size": 8.0,
-    "axes.edgecolor": GREY,
+    "font.size": 7.5,
+    "mathtext.fontset": "dejavusans",
+    "axes.edgecolor": SOFT,
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.labelcolor": BLACK,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": BLACK,
-    "ytick.labelcolor": BLACK,
-    "legend.frameon": False,
-    "svg.hashsalt": "peakmesh",
+    "axes.labelcolor": INK,
     "axes.formatter.useoffset": False,
-    "axes.autolimit_mode": "round_numbers",  # from tick to tick
-    "axes.ymargin": 0.0,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "svg.hashsalt": "peakmesh",
+    "pdf.fonttype": 42,  # TrueType, as journals ask for
 }
+_MATHEMATICS = {"ẑ": r"$\hat{z}$", "z̃": r"$\tilde{z}$", "γ_path": r"$\gamma_{\mathrm{path}}$", "step k": "step $k$"}
+
+Draw = Callable[[float], Figure]  # a picture of this width, in inches
 
 
-def write(recording: Path, folder: Path, *, force: bool = False) -> list[Path]:
-    """Both figures of a recording as SVG and PNG; only the outputs where no plant was recorded."""
-    log = load(recording)
-    figures = {"outputs": outputs_figure}
-    if log.has_plant:
-        figures["errors"] = errors_figure
-    paths = {
-        (name, kind): folder / f"{recording.name.removesuffix('.part').removesuffix('.mcap')}-{name}.{kind}"
-        for name in figures
-        for kind in ("svg", "png")
-    }
+def figure(chart: Chart, shown: Columns, width: float) -> Figure:
+    """One chart; its title and its explanation are for the caption, which is the author's."""
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(width, _height(chart, width)), layout="constrained")
+        axes = drawing.subplots()
+        if chart.rows is None:
+            _marks(axes, chart, shown)
+        elif isinstance(chart.rows, Map):
+            _map(drawing, axes, chart.rows, shown)
+        else:
+            _raster(axes, chart.rows, shown)
+        axes.set_xlim(shown.first - 0.5, shown.stop - 0.5)
+        axes.set_xticks(step_ticks(shown.first, shown.stop - 1, 10 if width > 5.0 else 5))
+        axes.set_xlabel(_mathematics("step k"))
+        handles, labels = axes.get_legend_handles_labels()
+        if len(labels) > 1 or isinstance(chart.rows, Raster):
+            many = 4 if width > 5.0 else 2
+            drawing.legend(handles, labels, loc="outside upper left", ncols=min(many, len(labels)), columnspacing=1.2)
+        return drawing
+
+
+def _height(chart: Chart, width: float) -> float:
+    if chart.categories:
+        return 0.7 + 0.14 * min(len(chart.categories), 10)
+    if chart.rows is not None:
+        return 0.9 + min(5.0, max(0.5, 0.14 * len(chart.rows.rows)))
+    rows = -(-len(chart.marks) // (4 if width > 5.0 else 2))
+    return HEIGHT + 0.15 * rows
+
+
+def _marks(axes: Any, chart: Chart, shown: Columns) -> None:
+    scale = chart.scale(shown)
+    axes.set_yscale("log" if scale.log else "linear")
+    axes.set_ylim(scale.low, scale.high)
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
+    edges = shown.first - 0.5 + np.minimum(np.arange(shown.number + 1) * shown.stretch, shown.stop - shown.first)
+    for mark in chart.marks:
+        look, name = LOOKS[mark.look], _mathematics(mark.name)
+        fine = 0.55 if shown.number <= FINE * axes.figure.get_figwidth() else 0.3
+        style: dict[str, Any] = {"color": look.light, "linewidth": fine * look.width}
+        if look.dashes:
+            style["linestyle"] = (0, look.dashes)
+        if isinstance(mark, Level):
+            if scale.low <= mark.value <= scale.high:
+                axes.axhline(mark.value, label=name, **style)
+        elif isinstance(mark, Band) or shown.stretch > 1:
+            low, high = extremes(mark, shown)
+            axes.stairs(high, edges, baseline=low, fill=True, color=look.light, linewidth=0.3, label=name)
+        else:
+            _line(axes, mark, shown, edges, style, name)
+    axes.set_ylabel(_mathematics(chart.unit))
+    if chart.categories:
+        every = max(1, len(chart.categories) // 10)
+        axes.set_yticks(range(len(chart.categories))[::every], chart.categories[::every])
+
+
+def _line(axes: Any, mark: Line, shown: Columns, edges: Any, style: dict[str, Any], name: str) -> None:
+    values, few = mark.values[shown.first : shown.stop], shown.number <= DOTTED
+    low = axes.get_ylim()[0]
+    if axes.get_yscale() == "log":  # what is below the axis lies on its edge
+        values = np.where(values < low, low, values)
+    dots = {"marker": "o", "linestyle": "none", "color": style["color"], "clip_on": False, "zorder": 3}
+    dots |= {"markersize": 2.4 if few else 0.9, "markeredgewidth": 0.0}
+    if mark.drawn == "dots" or (mark.drawn == "dots or steps" and few):
+        axes.plot(np.arange(shown.first, shown.stop), values, label=name, **dots)
+        return
+    axes.stairs(values, edges, baseline=None, label=name, **style)
+    if mark.drawn == "dotted steps" and few:
+        axes.plot(np.arange(shown.first, shown.stop), values, **dots)
+
+
+def _map(drawing: Any, axes: Any, rows: Map, shown: Columns) -> None:
+    values, scale = shown.extremes(rows.values)[1], rows.scale(shown)
+    norm = (LogNorm if scale.log else Normalize)(scale.low, scale.high, clip=True)
+    colours = ListedColormap([[part / 255.0 for part in colour] for colour in ramp(256)])
+    image = axes.imshow(values.T, norm=norm, cmap=colours, interpolation="none", **_extent(shown, len(rows.rows)))
+    drawing.colorbar(image, ax=axes, location="top", aspect=60, pad=0.02).set_label(_mathematics(rows.name))
+    _name_rows(axes, rows.rows)
+
+
+def _raster(axes: Any, rows: Raster, shown: Columns) -> None:
+    strips = len(rows.layers) + 1
+    cells = np.zeros((len(rows.rows) * strips, shown.number, 4))
+    for place, (name, look, values) in enumerate(rows.layers):
+        cells[place::strips] = to_rgba(LOOKS[look].light)
+        cells[place::strips, :, 3] = np.nan_to_num(shown.means(values).T)
+        axes.plot([], [], "s", color=LOOKS[look].light, label=name)
+    axes.imshow(cells, interpolation="none", **_extent(shown, len(rows.rows)))
+    _name_rows(axes, rows.rows)
+
+
+def _extent(shown: Columns, rows: int) -> dict[str, Any]:
+    right = shown.first + shown.number * shown.stretch - 0.5
+    return {"aspect": "auto", "extent": (shown.first - 0.5, right, rows - 0.5, -0.5)}
+
+
+def _name_rows(axes: Any, names: tuple[str, ...]) -> None:
+    every = max(1, -(-len(names) // 36))
+    axes.set_yticks(range(len(names))[::every], names[::every])
+    axes.set_ylabel("node")
+
+
+def topologies(problem: Problem, width: float) -> Figure:
+    """Who hears whom in every mode: figure 1 of the paper."""
+    across = min(len(problem.topologies), 6 if width > 5.0 else 4)
+    down, side = -(-len(problem.topologies) // across), width / across
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(width, down * (side + 0.2)), layout="constrained")
+        for s, axes in enumerate(drawing.subplots(down, across, squeeze=False).flat):
+            axes.set_axis_off()
+            if s < len(problem.topologies):
+                _graph(axes, problem, s)
+        return drawing
+
+
+def _graph(axes: Any, problem: Problem, s: int) -> None:
+    reach, named = graphs.radius(problem.n) + 26.0, problem.n <= graphs.NAMED
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    axes.set_title(problem.mode_names[s], fontsize=7.5, pad=1.0)
+    for link in graphs.links(problem, s):
+        curve = Curve([link.start, link.middle, link.end], [Curve.MOVETO, Curve.CURVE3, Curve.CURVE3])
+        dashes = (0, (3.0, 2.0)) if link.lossy else "-"
+        axes.add_patch(PathPatch(curve, fill=False, color=SOFT, linewidth=0.6 if named else 0.2, linestyle=dashes))
+        if named:
+            axes.add_patch(Polygon(graphs.head(link), color=SOFT, linewidth=0.0))
+    for (x, y), name in zip(graphs.points(problem.n), problem.node_names, strict=True):
+        radius = graphs.node_radius(problem)
+        axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=INK, linewidth=0.7))
+        if named:
+            away = 1.0 if radius > 10.0 else 1.0 + 15.0 / (abs(complex(x, y)) or 1.0)
+            axes.text(
+                x * away,
+                y * away,
+                name,
+                ha="center",
+                va="center",
+                fontsize=6.0 if axes.figure.get_figwidth() > 5.0 else 4.5,
+            )
+
+
+def ladder(rungs: Iterable[tuple[str, float]], width: float) -> Figure:
+    """The rungs as bars, each with its value."""
+    names, values = zip(*rungs, strict=True)
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(width, 0.5 + 0.3 * len(names)), layout="constrained")
+        axes = drawing.subplots()
+        places = range(len(names))
+        bars = axes.barh(places, values, color=LOOKS["path"].light, height=0.4)
+        axes.bar_label(bars, [rung_text(name, value) for name, value in zip(names, values, strict=True)], padding=3)
+        for place, name in zip(places, names, strict=True):
+            axes.text(0.004 * max(values), place - 0.26, _mathematics(name), va="bottom", fontsize=7.0)
+        axes.set_yticks([])
+        axes.set_ylim(len(names) - 0.6, -0.8)
+        axes.margins(x=0.2)
+        axes.set_xlabel("largest error / root of the energy (dimensionless)")
+        return drawing
+
+
+def drawings(charts: Mapping[str, Chart], *, stop: int) -> dict[str, Draw]:
+    """A picture for every chart, by its name, of the steps before `stop`."""
+    shown = columns(0, stop, MOST_COLUMNS)
+
+    def drawn(chart: Chart) -> Draw:
+        return lambda width: figure(chart, shown, width)
+
+    return {name: drawn(chart) for name, chart in charts.items()}
+
+
+def write(pictures: dict[str, Draw], folder: Path, *, kind: str, force: bool = False) -> list[Path]:
+    """Every picture at every width; nothing is written where one of the files is in the way."""
+    paths = {(name, width): folder / f"{name}-{width}.{kind}" for name in pictures for width in WIDTHS}
     for path in paths.values():
         refuse_overwrite(path, force=force)
-    for name, draw in figures.items():
-        figure = draw(log)
-        for kind in ("svg", "png"):
-            write_whole(paths[name, kind], _rendered(figure, kind), force=force)
+    for (name, width), path in paths.items():
+        write_whole(path, rendered(pictures[name](WIDTHS[width]), kind), force=force)
     return list(paths.values())
 
 
-def outputs_figure(log: Log) -> Figure:
-    """z and every z_hat_i, a panel for each output; the mode of every step below."""
-    problem, label = log.gains.problem, _node_label(log.gains.problem.n, r"$\hat{z}$ of node ")
-    with matplotlib.rc_context(STYLE):
-        figure, panels, strip = _canvas(log, strip_height=0.35 + 0.1 * len(problem.topologies))
-        for row, axes in enumerate(panels):
-            if log.has_plant:
-                _line(axes, log.z[:, row], colour=BLACK, width=2.2, label="$z$", over=1)
-            for i, style in enumerate(_styles(problem.n, _shown_steps(log))):
-                _line(axes, log.z_hat[:, i * problem.nz + row], label=label(problem.node_names[i]), **style)
-            axes.set_ylabel(_indexed(r"$z$ and $\hat{z}_i$" if log.has_plant else r"$\hat{z}_i$", row, problem.nz))
-        _legend(figure, panels[0])
-        _draw_modes(strip, log)
-    return figure
-
-
-def errors_figure(log: Log) -> Figure:
-    """z - z_hat_i of every node, a panel for each output; the norm over all of them below, beside gamma's bound."""
-    problem, label = log.gains.problem, _node_label(log.gains.problem.n, "node ")
-    with matplotlib.rc_context(STYLE):
-        figure, panels, strip = _canvas(log, strip_height=1.1)
-        for row, axes in enumerate(panels):
-            axes.axhline(0.0, color=PALE, linewidth=0.8, zorder=0)
-            for i, style in enumerate(_styles(problem.n, _shown_steps(log))):
-                z_tilde = log.z[:, row] - log.z_hat[:, i * problem.nz + row]
-                _line(axes, z_tilde, label=label(problem.node_names[i]), **style)
-            axes.set_ylabel(_indexed(r"$z - \hat{z}_i$", row, problem.nz))
-        _legend(figure, panels[0])
-        _draw_norm(strip, log)
-    return figure
-
-
-def _canvas(log: Log, *, strip_height: float) -> tuple[Figure, list[Any], Any]:
-    """A figure with a panel for each output and a lower strip, all over the same steps."""
-    problem = log.gains.problem
-    legend_rows = -(-(problem.n + 1) // _legend_columns(problem.n))
-    heights = [2.3 if problem.nz == 1 else 1.6] * problem.nz + [strip_height]
-    figure = Figure(figsize=(WIDTH, sum(heights) + 0.55 + 0.16 * legend_rows), layout="constrained")
-    *panels, strip = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    for axes in panels:
-        axes.tick_params(labelbottom=False)
-        axes.yaxis.set_major_locator(MaxNLocator(7, steps=(1, 2, 2.5, 5, 10), min_n_ticks=4))
-    shown = _shown_steps(log)
-    strip.set_xlim(0, max(1, shown - 1))
-    strip.xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10)))
-    strip.set_xlabel("step $k$")
-    if shown < log.steps:
-        curves = r"$|z|$ and every $|\hat{z}_i|$" if log.has_plant else r"every $|\hat{z}_i|$"
-        rest = f"steps {shown} to {log.steps - 1}, where {curves} stay below {100 * SETTLED:g} % of the largest"
-        panels[0].set_title(f"{rest}, are not shown", loc="right", color=GREY, fontsize=6.5)
-    figure.supxlabel(_caption(log), x=0.99, ha="right", color=GREY, fontsize=6.5)
-    figure.align_ylabels()
-    return figure, panels, strip
-
-
-def _caption(log: Log) -> str:
-    gamma = checked_gamma(log.gains)
-    unproved = "γ is not proved" if gamma.is_claimed else "γ is not claimed"
-    proved = f"γ = {rounded_up(gamma.value)}" if gamma.failure is None else unproved
-    return f"{log.gains.problem.name}, seed {log.seed}, {proved}"
-
-
-def _shown_steps(log: Log) -> int:
-    """Steps until everything has settled for good; all of them where it never does."""
-    size = np.nan_to_num(np.abs(np.hstack([log.z, log.z_hat]))).max(axis=1, initial=0.0)
-    moving = np.flatnonzero(size > SETTLED * size.max(initial=0.0))
-    shown = int(moving[-1]) + 2 if len(moving) else log.steps
-    return shown if shown < 0.8 * log.steps else log.steps
-
-
-def _draw_modes(axes: Any, log: Log) -> None:
-    """The staircase of figure 2; of a long run, how much of every stretch each mode has."""
-    names = log.gains.problem.mode_names
-    mode = log.mode[: _shown_steps(log)]
-    if len(mode) <= STAIRS:
-        known = (mode >= 0) & (mode < len(names))
-        axes.step(np.arange(len(mode)), np.where(known, mode, np.nan), where="post", color=GREY, linewidth=0.9)
-    else:
-        here = mode[: len(mode) - len(mode) % STRETCHES].reshape(STRETCHES, -1)
-        shares = [(here == s).mean(axis=1) for s in range(len(names))]
-        extent = (0, here.size, -0.5, len(names) - 0.5)
-        axes.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", aspect="auto", extent=extent)
-    axes.set_ylim(-0.5, len(names) - 0.5)
-    axes.set_yticks(range(len(names)), names if len(names) <= 8 else [""] * len(names))
-    axes.set_ylabel("mode" if len(mode) <= STAIRS else "mode (share)")
-
-
-def _draw_norm(axes: Any, log: Log) -> None:
-    """|z_tilde(k)| over all nodes, its peak, and gamma sqrt(sum over j < k of |w(j)|^2) where gamma is proved."""
-    axes.yaxis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10), min_n_ticks=3))
-    z_tilde, gamma = log.error_norms(), checked_gamma(log.gains)
-    if gamma.failure is None:
-        energies = (np.nan_to_num(log.w) ** 2).sum(axis=1)
-        bound = gamma.value * np.sqrt(np.cumsum(energies) - energies)
-        label = r"$\gamma\,(\Sigma_{j<k}|w(j)|^2)^{1/2}$, a bound in the mean"
-        _line(axes, bound, colour=GREY, width=0.9, dashes=DASHES[1], label=label)
-    _line(axes, z_tilde, colour=BLACK, width=1.0, label=r"$|\tilde{z}(k)|$, all nodes")
-    if np.isfinite(z_tilde).any():
-        k = int(np.nanargmax(z_tilde))
-        axes.plot(k, z_tilde[k], "o", color=BLACK, markersize=3.5, label=f"peak {z_tilde[k]:.3g} at step {k}")
-    axes.set_ylim(bottom=0.0)
-    axes.set_ylabel(r"$|\tilde{z}|$")
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.98), borderaxespad=0.0, ncols=3, fontsize=7)
-
-
-def _line(
-    axes: Any,
-    values: Array,
-    *,
-    colour: str,
-    width: float = 1.1,
-    dashes: Any = "-",
-    label: str,
-    over: int = 2,
-    marks: Sequence[int] = (),
-    **more: Any,
-) -> None:
-    """A line over all steps, with markers at the steps `marks` alone."""
-    steps, values = thinned(values)
-    if marks:
-        more["markevery"] = np.unique(np.searchsorted(steps[:-1], marks)).tolist()
-    axes.plot(steps, values, color=colour, linewidth=width, linestyle=dashes, label=label, zorder=over, **more)
-
-
-def thinned(values: Array) -> tuple[Array, Array]:
-    """Steps and values of a line; of a long one the smallest and the largest value of every stretch."""
-    if len(values) <= POINTS:
-        return np.arange(len(values), dtype=np.float64), values
-    stretch = -(-2 * len(values) // POINTS)
-    rows = np.full((-(-len(values) // stretch), stretch), np.nan)
-    rows.flat[: len(values)] = values
-    low = np.argmin(np.where(np.isnan(rows), np.inf, rows), axis=1)
-    high = np.argmax(np.where(np.isnan(rows), -np.inf, rows), axis=1)
-    kept = np.unique(np.arange(len(rows))[:, None] * stretch + np.column_stack([low, high]))
-    return kept.astype(np.float64), values[kept]
-
-
-def _styles(n: int, steps: int) -> Iterator[dict[str, Any]]:
-    """How to draw each of n nodes over so many steps: those that coincide are told apart by markers and widths."""
-    raster = {"rasterized": True} if n > RASTER_ABOVE else {}
-    if n <= len(MARKERS):
-        every = -(-steps // MARKED)
-        broadest = 1.8 if every == 1 else 1.2
-        for i, marker in enumerate(MARKERS[:n]):
-            marked = {"marker": marker, "markersize": 4.2, "markerfacecolor": "none", "markeredgewidth": 0.8}
-            marked["marks"] = range(i * every // n, steps, every)
-            dashes, width = DASHES[i // len(COLOURS)], broadest - i * (broadest - 0.6) / max(1, n - 1)
-            yield {"colour": COLOURS[i % len(COLOURS)], "dashes": dashes, "width": width, **marked}
-    elif n <= len(COLOURS) * len(DASHES):
-        for i in range(n):
-            dashes = DASHES[i // len(COLOURS)]
-            yield {"colour": COLOURS[i % len(COLOURS)], "dashes": dashes, **raster}
-    else:
-        scale = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, n))
-        for colour, dashes in zip(scale, islice(cycle(DASHES), n), strict=True):
-            yield {"colour": matplotlib.colors.to_hex(colour), "dashes": dashes, "width": 0.6, **raster}
-
-
-def _node_label(n: int, words: str) -> Callable[[str], str]:
-    return words.__add__ if n <= RASTER_ABOVE else str
-
-
-def _legend_columns(n: int) -> int:
-    return 5 if n <= RASTER_ABOVE else 12
-
-
-def _legend(figure: Any, axes: Any) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    n = len(labels)
-    title = {} if n > RASTER_ABOVE else {"handlelength": 2.2}
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper left",
-        ncols=min(n, _legend_columns(n)),
-        columnspacing=1.2,
-        fontsize=8 if n <= RASTER_ABOVE else 6,
-        **title,
-    )
-
-
-def _indexed(letter: str, row: int, rows: int) -> str:
-    """The label of one output; numbered only where there are several."""
-    return letter if rows == 1 else f"{letter}, output {row + 1}"
-
-
-def _rendered(figure: Any, kind: str) -> bytes:
+def rendered(drawing: Figure, kind: str) -> bytes:
     """The same bytes for the same figure: no date, no random ids."""
-    data = io.BytesIO()
+    data, undated = io.BytesIO(), {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
     with matplotlib.rc_context(STYLE):
-        figure.savefig(data, format=kind, dpi=300, metadata={"Date": None} if kind == "svg" else None)
+        drawing.savefig(data, format=kind, dpi=DPI, metadata=undated[kind])
     return data.getvalue()
+
+
+def _mathematics(text: str) -> str:
+    for plain, set_text in _MATHEMATICS.items():
+        text = text.replace(plain, set_text)
+    return text

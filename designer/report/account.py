@@ -1,0 +1,182 @@
+"""What a report tells of a run, in numbers: one place for the page, the figures and the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.errors import InputError, RunBroken
+from agent.contract.gains import Gains
+from agent.contract.problem import White
+from designer.ladder import ladder_of
+from designer.replay import judge
+from designer.replay.log import Log, load
+from designer.replay.trace import Trace
+from designer.replay.verdict import Verdict
+
+SETTLED = 0.01  # of the largest value: what stays below it to the end need not be seen
+MOST_OF_A_RUN = 0.8  # a part of it is worth a picture of its own only where it is shorter than that
+CONFIDENCE = 0.95  # of the bound that single runs keep
+THIS_RUN = "this run: largest error / root of the energy"
+_ROUNDED = 1e-6  # relative: room for a proof
+
+
+class Chance(NamedTuple):
+    """What single runs keep with a probability: P(sup_k |z_tilde(k)| >= c) <= gamma^2 E sum |w|^2 / c^2."""
+
+    gamma: float  # of a P with (17) and (18) of Theorem 1
+    energy: float  # E sum |w|^2 before the last step
+
+    def level(self, confidence: float = CONFIDENCE) -> float:
+        """The c below which |z_tilde| stays at every step of a run with this probability at least."""
+        return float(self.gamma * np.sqrt(self.energy / (1.0 - confidence)))
+
+
+@dataclass(frozen=True, eq=False)
+class Account:
+    """A run, the verdict on it, and what both come to."""
+
+    log: Log
+    verdict: Verdict
+    trace: Trace
+
+    @classmethod
+    def of(cls, path: Path) -> Account:
+        """Read and judge a recording. Raises InputError where it is none, RunBroken where it holds no step."""
+        log = load(path)
+        if not log.steps:
+            raise RunBroken(f"{path} holds no step of its run, so there is nothing to report")
+        trace = Trace(log.steps)
+        return cls(log, judge(log, trace), trace)
+
+    @cached_property
+    def errors(self) -> Array:
+        """z - z_hat_i, (steps, n, nz); where the plant is not known, each node's distance from their median."""
+        z_hat = self.log.z_hat.reshape(self.log.steps, self.log.gains.problem.n, -1)
+        if self.log.has_plant:
+            return np.asarray(self.log.z[:, None, :] - z_hat)
+        return np.asarray(z_hat - over_nodes(np.nanmedian, z_hat)[:, None, :])
+
+    @cached_property
+    def sizes(self) -> Array:
+        """The norm of `errors` of each node, (steps, n)."""
+        return np.asarray(np.linalg.norm(self.errors, axis=2))
+
+    @cached_property
+    def rms(self) -> Array:
+        """The root of the mean of their squares over all steps, (n,); 0 where nothing is known of a node."""
+        known = np.isfinite(self.sizes)
+        return np.asarray(np.sqrt(np.nansum(self.sizes**2, axis=0) / np.maximum(known.sum(axis=0), 1)))
+
+    @cached_property
+    def ranking(self) -> list[int]:
+        """The nodes, that with the largest `rms` first."""
+        return [int(i) for i in np.argsort(-self.rms, kind="stable")]
+
+    @cached_property
+    def settled(self) -> int:
+        """Steps until z and every z_hat_i have become small for good; all steps where that is not much shorter."""
+        size = np.nan_to_num(np.abs(np.hstack([self.log.z, self.log.z_hat]))).max(axis=1, initial=0.0)
+        moving = np.flatnonzero(size > SETTLED * size.max(initial=0.0))
+        shown = int(moving[-1]) + 2 if len(moving) else self.log.steps
+        return shown if shown < MOST_OF_A_RUN * self.log.steps else self.log.steps
+
+    @cached_property
+    def mean_bound(self) -> Array | None:
+        """gamma sqrt(sum over j < k of |w(j)|^2), (steps,); None where gamma is not proved, or errors not known."""
+        if self.verdict.gamma.failure is not None or not self.log.has_plant:
+            return None
+        return np.asarray(self.verdict.gamma.value * np.sqrt(self.trace.energy_before))
+
+    @cached_property
+    def chance(self) -> Chance | None:
+        """None where the gains have no proved P, or errors are not known."""
+        if self.mean_bound is None:
+            return None
+        gamma = single_run_gamma(self.log.gains)
+        if gamma is None:
+            return None
+        disturbance, before = self.log.gains.problem.disturbance, self.log.steps - 1
+        energy = float(self.trace.energy_before[-1])
+        if isinstance(disturbance, White):
+            energy = before * self.log.gains.problem.nw * disturbance.deviation**2
+        return Chance(gamma, energy)
+
+    @cached_property
+    def lost(self) -> Array:
+        """1 where the measurement of a node was lost, 0 where it arrived, NaN where that is not known, (steps, n)."""
+        log = self.log
+        arrived = np.where(np.array(log.external), np.nan, log.theta)
+        seen = np.array([node.seen for node in log.gains.problem.nodes])
+        return np.asarray(1.0 - np.where(np.isnan(arrived) & seen, log.measured, arrived))
+
+    @cached_property
+    def done_without(self) -> Array:
+        """How many messages of its neighbours a node did not use in a step, (steps, n); NaN where that is not known.
+
+        It put its own estimate in the place of each. The messages of step k are named in the estimate of step k + 1.
+        """
+        log, problem = self.log, self.log.gains.problem
+        unused = np.asarray(~log.senders.members())
+        without = np.full((log.steps, problem.n), np.nan)
+        for s in range(len(problem.topologies)):
+            at = np.flatnonzero(log.mode[:-1] == s)
+            for i in range(problem.n):
+                heard = log.heard[at + 1, i]
+                known = heard >= 0
+                neighbours = list(problem.neighbours(s, i))
+                without[at[known], i] = unused[heard[known]][:, neighbours].sum(axis=1)
+        return without
+
+    @cached_property
+    def rungs(self) -> list[tuple[str, float]]:
+        """The ladder of the gains, and what this run came to beside it."""
+        verdict, rungs = self.verdict, ladder_of(self.log.gains).rungs()
+        if verdict.peak and verdict.energy and self.log.has_plant:
+            rungs.append((THIS_RUN, verdict.peak.size / verdict.energy**0.5))
+        return rungs
+
+    @cached_property
+    def mode_shares(self) -> Array:
+        """The part of all steps that each mode had, (modes,)."""
+        counts = np.bincount(self.log.mode[self.log.mode >= 0], minlength=len(self.log.gains.problem.topologies))
+        return np.asarray(counts[: len(self.log.gains.problem.topologies)] / max(1, self.log.steps))
+
+
+def single_run_gamma(gains: Gains) -> float | None:
+    """The least gamma that the certificate's P proves by (17) and (18), for what holds of single runs.
+
+    V = eta'P(r)eta minus the energy so far is a supermartingale by (17), and |z_tilde|^2 <= gamma^2 V by (18), so the
+    inequality of Ville gives `Chance`. A certificate of kind "exact" proves a smaller gamma by other means, which says
+    nothing of single runs; its P is taken all the same. None where there is no such P.
+    """
+    from designer.proof.certificate import lyapunov_matrix  # it loads ball arithmetic
+    from designer.proof.theorem1 import check
+
+    if gains.certificate.kind == "lyapunov":
+        return gains.certificate.gamma
+    p = gains.problem.plant_states
+    try:
+        P = lyapunov_matrix(gains)
+        M = np.zeros((gains.problem.n * gains.problem.nz, P.shape[1]))
+        M[:, p:] = np.kron(np.eye(gains.problem.n), gains.problem.plant.M)
+        square = max(np.linalg.eigvalsh(M @ np.linalg.solve((P_s + P_s.T) / 2.0, M.T))[-1] for P_s in P)
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    if not 0.0 < square < np.inf:
+        return None
+    gamma = float(np.sqrt(square) * (1.0 + _ROUNDED))
+    return gamma if check(gains.problem, gains.K, gains.H, P=P, gamma=gamma).holds else None
+
+
+def over_nodes(statistic: Callable[..., Array], values: Array) -> Array:
+    """np.nanmedian and the like over axis 1; NaN where all is NaN."""
+    nothing = np.asarray(np.isnan(values).all(axis=1))
+    filled = np.where(nothing[:, None], 0.0, values)
+    return np.asarray(np.where(nothing, np.nan, statistic(filled, axis=1)))

@@ -1,0 +1,120 @@
+"""What a report says in words, for whoever was not there and need not know the mathematics."""
+
+from __future__ import annotations
+
+from agent.contract.errors import counted
+from designer.replay.verdict import CLAIMS, Divergence, Proof, Verdict
+from designer.report.account import Account
+from designer.report.scales import brief
+
+PROOFS = {  # what each proof of a replay shows, in plain words
+    1: (
+        "The inputs are genuine",
+        "Topologies, losses and disturbance are those that the seed gives, plant and sensors obey their equations, and "
+        "what every node says of itself is so.",
+    ),
+    2: (
+        "Every step follows from the one before",
+        "From what was recorded at a step, the model of the whole network gives what was recorded at the next.",
+    ),
+    3: (
+        "The whole run follows from its beginning",
+        "The model of the whole network, left to itself from the first step on, stays with the recording.",
+    ),
+    4: ("Nothing is missing, nothing is there twice", "Every sender's messages are there, each once."),
+    5: (
+        "The errors kept their bound",
+        "At no step were they larger than a disturbance of this size can make them, with this run's topologies and "
+        "losses.",
+    ),
+}
+
+
+def verdict_word(verdict: Verdict) -> str:
+    """One word, and the class of the style sheet: "sound", "not whole", "false"."""
+    if not verdict.agrees:
+        return "false"
+    return "sound" if verdict.finished else "not whole"
+
+
+def verdict_sentence(verdict: Verdict) -> str:
+    """Whether the recording can be believed."""
+    if not verdict.agrees:
+        return f"This recording is not a true account of the run: {_what_is_wrong(verdict)}."
+    follows = (
+        "every number in it was computed again, independently of the nodes, and is what this network must give, to "
+        "within rounding"
+    )
+    if verdict.finished:
+        return f"This recording can be believed: no message is missing, and {follows}."
+    so_far = f"{verdict.steps} of {counted(verdict.planned, 'step')}"
+    why = verdict.reason or verdict.damage or "its end is missing"
+    return f"As far as it goes this recording can be believed: {follows}. But it is not whole, it has {so_far}: {why}."
+
+
+def _what_is_wrong(verdict: Verdict) -> str:
+    if verdict.first_divergence is not None:
+        return divergence_sentence(verdict.first_divergence)
+    for faults, word in ((verdict.missing, "missing"), (verdict.duplicates, "there more than once")):
+        if faults.total:
+            first = faults.first[0]
+            are = "is" if faults.total == 1 else "are"
+            where = f"the first is {first.topic} of step {first.step}"
+            return f"{counted(faults.total, 'message')} {are} {word}; {where}"
+    for fault in (*verdict.strange, *verdict.numbering):
+        return fault
+    return "the errors were larger than a disturbance of this size can make them"
+
+
+def divergence_sentence(first: Divergence) -> str:
+    """The first place that is wrong."""
+    logged, expected = (
+        f'"{value}"' if isinstance(value, str) else brief(value, 6) for value in (first.logged, first.expected)
+    )
+    if logged == expected:
+        logged, expected = repr(first.logged), repr(first.expected)
+    return f"at step {first.step}, {first.place} is {logged} where it must be {expected}"
+
+
+def error_sentence(account: Account) -> str:
+    """How large the errors were, and what is promised of them."""
+    verdict, gamma = account.verdict, account.verdict.gamma
+    if verdict.peak is None or not account.log.has_plant:
+        return "How far off the estimates were is not known: real sensors measured, so nobody knows what was true."
+    peak = verdict.peak
+    said = [f"The estimates of all nodes together were off by {brief(peak.size, 3)} at most, at step {peak.step}."]
+    if account.mean_bound is not None:
+        bound = float(account.mean_bound[-1])
+        above = "" if verdict.peak.size <= bound else " This run was above that, as single runs may be."
+        said.append(
+            f"Over many such runs the root of the mean square stays below {brief(bound, 3)} at every step; that is "
+            f"proved.{above}"
+        )
+    else:
+        why = (
+            "nothing is claimed of these gains"
+            if not gamma.is_claimed
+            else "what is claimed of these gains is not proved"
+        )
+        said.append(f"No bound in the mean stands beside it: {why}.")
+    return " ".join(said)
+
+
+def proof_outcome(proof: Proof) -> tuple[str, str]:
+    """The outcome in a word, and its mark."""
+    if proof.holds is None:
+        return "cannot be said", "–"
+    return ("holds", "✓") if proof.holds else ("fails", "✗")
+
+
+def proof_details(proof: Proof, tolerance: float) -> str:
+    """How much was looked at, and how close it came."""
+    details = [f"{grouped(proof.compared)} {CLAIMS[proof.number][1]}"] if proof.compared else []
+    if proof.number <= 3 and proof.compared:
+        details.append(f"largest gap {brief(proof.worst_gap, 2)}, allowed {brief(tolerance, 2)}")
+    return "; ".join([*details, *([proof.note] if proof.note else [])])
+
+
+def grouped(count: int) -> str:
+    """ "2 000 002", with narrow spaces that do not break."""
+    return f"{count:,}".replace(",", "\u202f")
