@@ -73,7 +73,7 @@ class Ladder(NamedTuple):
 
 def rung_text(name: str, value: float) -> str:
     """A rung's value: rounded up, but for the floor, which is a bound from below."""
-    return f"{value:.6f}" if name == FLOOR else rounded_up(value)
+    return f"{value:.6f}" if name == FLOOR or not value else rounded_up(value)
 
 
 def ladder_of(gains: Gains) -> Ladder:

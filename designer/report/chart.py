@@ -128,6 +128,12 @@ class Chart:
     categories: tuple[str, ...] = ()  # the numbers 0, 1, ... stand for these
     remark: str = ""  # what could not be drawn
 
+    def shares(self, shown: Columns) -> Array:
+        """How much of every column each category has, (categories, columns); NaN where nothing is known."""
+        (line,) = (mark for mark in self.marks if isinstance(mark, Line))
+        is_there = line.values[:, None] == np.arange(len(self.categories))
+        return shown.means(np.where(np.isnan(line.values)[:, None], np.nan, is_there)).T
+
     def scale(self, shown: Columns) -> Scale:
         """Of the marks, in these columns."""
         if self.categories:

@@ -18,9 +18,9 @@ from agent.contract.files import refuse_overwrite, write_whole
 from agent.contract.problem import Problem
 from designer.ladder import rung_text
 from designer.report import graphs
-from designer.report.chart import LOOKS, Band, Chart, Level, Line, Map, Raster, extremes
+from designer.report.chart import LOOKS, Band, Chart, Level, Line, Map, Mark, Raster, extremes
 from designer.report.colours import ramp
-from designer.report.scales import Columns, columns, step_ticks
+from designer.report.scales import Columns, Scale, columns, step_ticks
 
 WIDTHS = {"one-column": 3.5, "two-columns": 7.16}  # inches: what IEEE journals take, and others near enough
 DPI = 600
@@ -60,7 +60,12 @@ def figure(chart: Chart, shown: Columns, width: float) -> Figure:
     with matplotlib.rc_context(STYLE):
         drawing = Figure(figsize=(width, _height(chart, width)), layout="constrained")
         axes = drawing.subplots()
-        if chart.rows is None:
+        if chart.categories and shown.stretch > 1:
+            extent = _extent(shown, len(chart.categories))
+            axes.imshow(chart.shares(shown), cmap="Greys", vmin=0.0, vmax=1.0, interpolation="none", **extent)
+            _name_rows(axes, chart.categories, chart.unit)
+            axes.invert_yaxis()
+        elif chart.rows is None:
             _marks(axes, chart, shown)
         elif isinstance(chart.rows, Map):
             _map(drawing, axes, chart.rows, shown)
@@ -91,40 +96,45 @@ def _marks(axes: Any, chart: Chart, shown: Columns) -> None:
     axes.set_ylim(scale.low, scale.high)
     axes.grid(axis="y")
     axes.set_axisbelow(True)
-    edges = shown.first - 0.5 + np.minimum(np.arange(shown.number + 1) * shown.stretch, shown.stop - shown.first)
     for mark in chart.marks:
-        look, name = LOOKS[mark.look], _mathematics(mark.name)
-        fine = 0.55 if shown.number <= FINE * axes.figure.get_figwidth() else 0.3
-        style: dict[str, Any] = {"color": look.light, "linewidth": fine * look.width}
-        if look.dashes:
-            style["linestyle"] = (0, look.dashes)
-        if isinstance(mark, Level):
-            if scale.low <= mark.value <= scale.high:
-                axes.axhline(mark.value, label=name, **style)
-        elif isinstance(mark, Band) or shown.stretch > 1:
-            low, high = extremes(mark, shown)
-            axes.stairs(high, edges, baseline=low, fill=True, color=look.light, linewidth=0.3, label=name)
-        else:
-            _line(axes, mark, shown, edges, style, name)
+        _mark(axes, mark, shown, scale)
     axes.set_ylabel(_mathematics(chart.unit))
     if chart.categories:
         every = max(1, len(chart.categories) // 10)
         axes.set_yticks(range(len(chart.categories))[::every], chart.categories[::every])
 
 
-def _line(axes: Any, mark: Line, shown: Columns, edges: Any, style: dict[str, Any], name: str) -> None:
-    values, few = mark.values[shown.first : shown.stop], shown.number <= DOTTED
-    low = axes.get_ylim()[0]
-    if axes.get_yscale() == "log":  # what is below the axis lies on its edge
-        values = np.where(values < low, low, values)
-    dots = {"marker": "o", "linestyle": "none", "color": style["color"], "clip_on": False, "zorder": 3}
-    dots |= {"markersize": 2.4 if few else 0.9, "markeredgewidth": 0.0}
-    if mark.drawn == "dots" or (mark.drawn == "dots or steps" and few):
-        axes.plot(np.arange(shown.first, shown.stop), values, label=name, **dots)
+def _mark(axes: Any, mark: Mark, shown: Columns, scale: Scale) -> None:
+    """A mark as steps, as dots, as an area, or as a line over all steps."""
+    look, few = LOOKS[mark.look], shown.number <= DOTTED
+    broad = 0.55 if shown.number <= FINE * axes.figure.get_figwidth() else 0.3
+    style = {"color": look.light, "linewidth": broad * look.width, "label": _mathematics(mark.name)}
+    if isinstance(mark, Level):
+        if scale.low <= mark.value <= scale.high:
+            axes.axhline(mark.value, linestyle=_dashes(mark.look), **style)
         return
-    axes.stairs(values, edges, baseline=None, label=name, **style)
-    if mark.drawn == "dotted steps" and few:
-        axes.plot(np.arange(shown.first, shown.stop), values, **dots)
+    edges = shown.first - 0.5 + np.minimum(np.arange(shown.number + 1) * shown.stretch, shown.stop - shown.first)
+    low, high = extremes(mark, shown)
+    if scale.log:  # what is below the axis lies on its edge
+        low, high = np.maximum(low, scale.low), np.maximum(high, scale.low)
+    if isinstance(mark, Line) and (mark.drawn == "dots" or (mark.drawn == "dots or steps" and few)):
+        axes.plot((edges[:-1] + edges[1:]) / 2.0, high, **_dots(few), **style)
+    elif isinstance(mark, Band) or shown.stretch > 1:
+        alpha = 1.0 if isinstance(mark, Band) else 0.55
+        axes.stairs(high, edges, baseline=low, fill=True, alpha=alpha, **style | {"linewidth": 0.3})
+    else:
+        axes.stairs(low, edges, baseline=None, linestyle=_dashes(mark.look), **style)
+        if mark.drawn == "dotted steps" and few:
+            axes.plot((edges[:-1] + edges[1:]) / 2.0, low, **_dots(few), color=look.light)
+
+
+def _dots(few: bool) -> dict[str, Any]:
+    size = 2.4 if few else 0.9
+    return {"marker": "o", "linestyle": "none", "markersize": size, "markeredgewidth": 0.0, "clip_on": False}
+
+
+def _dashes(look: str) -> Any:
+    return (0, LOOKS[look].dashes) if LOOKS[look].dashes else "-"
 
 
 def _map(drawing: Any, axes: Any, rows: Map, shown: Columns) -> None:
@@ -152,10 +162,10 @@ def _extent(shown: Columns, rows: int) -> dict[str, Any]:
     return {"aspect": "auto", "extent": (shown.first - 0.5, right, rows - 0.5, -0.5)}
 
 
-def _name_rows(axes: Any, names: tuple[str, ...]) -> None:
+def _name_rows(axes: Any, names: tuple[str, ...], unit: str = "node") -> None:
     every = max(1, -(-len(names) // 36))
     axes.set_yticks(range(len(names))[::every], names[::every])
-    axes.set_ylabel("node")
+    axes.set_ylabel(unit)
 
 
 def topologies(problem: Problem, width: float) -> Figure:

@@ -29,7 +29,7 @@ Views = dict[str, tuple[Columns, str]]  # the steps of each, and what they are
 def page(account: Account) -> str:
     """The whole file."""
     title = escape(f"{account.log.gains.problem.name}, seed {account.log.seed}: report of a run")
-    start = account.verdict.peak.step if account.verdict.peak else 0
+    start, _ = _most_telling(account)
     figures, data = _figures(account)
     return "\n".join(
         [
@@ -65,15 +65,23 @@ def _style() -> str:
     return f":root{{{colours['light']}}}{dark}{rules}{_asset('page.css')}"
 
 
+def _most_telling(account: Account) -> tuple[int, str]:
+    """The step that is shown first, and why."""
+    verdict = account.verdict
+    if verdict.first_divergence is not None:
+        return verdict.first_divergence.step, "around the first divergence"
+    return (verdict.peak.step, "around the largest error") if verdict.peak else (0, "from the beginning")
+
+
 def _views(account: Account) -> Views:
-    """All steps; before them, of a run that settles, those until then, and of another long one the largest error."""
-    steps = account.log.steps
+    """All steps; before them, of a run that settles, those until then, and of another long one the most telling."""
+    steps, (middle, what) = account.log.steps, _most_telling(account)
     views = {ALL: (columns(0, steps, MOST_COLUMNS), f"all, 0 to {steps - 1}")}
-    if account.settled < steps:
+    if middle < account.settled < steps:
         part, what = range(account.settled), "until everything has settled"
-    elif steps > 2 * CLOSE_UP and account.verdict.peak is not None:
-        first = min(max(0, account.verdict.peak.step - CLOSE_UP // 2), steps - CLOSE_UP)
-        part, what = range(first, first + CLOSE_UP), "around the largest error"
+    elif steps > 2 * CLOSE_UP:
+        first = min(max(0, middle - CLOSE_UP // 2), steps - CLOSE_UP)
+        part = range(first, first + CLOSE_UP)
     else:
         return views
     shown = columns(part.start, part.stop, MOST_COLUMNS)

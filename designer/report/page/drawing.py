@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from designer.report.chart import Chart
 from designer.report.page.lines import marks
-from designer.report.page.maps import rows_of
+from designer.report.page.maps import rows_of, shares_of
 from designer.report.scales import Columns
 
 
@@ -21,10 +21,12 @@ class Drawn(NamedTuple):
 
 def draw(chart: Chart, shown: Columns, *, ident: str) -> Drawn:
     """`ident` names the figure on the page."""
-    if chart.rows is None:
-        body, data = marks(chart, shown)
-    else:
+    if chart.rows is not None:
         body, data = rows_of(chart.rows, shown)
+    elif chart.categories and shown.stretch > 1:
+        body, data = shares_of(chart, shown)
+    else:
+        body, data = marks(chart, shown)
     remark = f'<p class="remark">{escape(chart.remark)}</p>' if chart.remark else ""
     html = (
         f'<figure id="{ident}" aria-labelledby="{ident}-title"><figcaption><h3 id="{ident}-title">'

@@ -19,14 +19,9 @@ CATEGORIES = 12  # that are named
 DOTTED = 150  # columns up to which dots have their full size
 
 
-def number(value: float) -> str:
-    """A tick's text."""
-    return f"{value:g}".replace("-", "−")
-
-
 def power(value: float) -> str:
     """A tick's text on a logarithmic axis."""
-    return f"10<sup>{number(round(np.log10(value)))}</sup>"
+    return f"10<sup>{brief(round(np.log10(value)))}</sup>"
 
 
 def marks(chart: Chart, shown: Columns) -> tuple[str, str]:
@@ -61,7 +56,7 @@ def _ticks(chart: Chart, scale: Scale) -> list[tuple[float, str]]:
     if chart.categories:
         names = [(float(place), escape(name)) for place, name in enumerate(chart.categories)]
         return names[:: max(1, len(names) // CATEGORIES)]
-    return [(tick, power(tick) if chart.log else number(tick)) for tick in scale.ticks()]
+    return [(tick, power(tick) if chart.log else brief(tick)) for tick in scale.ticks()]
 
 
 def _across(scale: Scale, value: float, shown: Columns) -> str:

@@ -10,13 +10,15 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from designer.report.chart import LOOKS, Map, Raster
+from agent.contract.arrays import Array
+from designer.report.chart import LOOKS, Chart, Map, Raster
 from designer.report.colours import css_ramp, ramp, rgb
 from designer.report.page.frame import legend, legend_item, plot
 from designer.report.page.png import png
 from designer.report.scales import Columns, brief
 
 LEVELS = 255  # of a map's colours
+SHARE = (120, 128, 136)  # red, green and blue of a share, on white and on black
 SHADES = 15  # of a raster's marks, where a column is many steps
 
 
@@ -26,8 +28,31 @@ def rows_of(rows: Map | Raster, shown: Columns) -> tuple[str, str]:
     height = n * (18 if n <= 12 else 12 if n <= 40 else 6)
     every = max(1, -(-11 * n // height))
     places = [(1.0 - (i + 0.5) / n, escape(name)) for i, name in enumerate(rows.rows) if i % every == 0]
-    names = f'"rows":{json.dumps(list(rows.rows))}'
+    names = f'"rows":{json.dumps([f"node {name}" for name in rows.rows])}'
     return legend(items) + plot("node", picture, places, shown, height), f"{names},{data}"
+
+
+def shares_of(chart: Chart, shown: Columns) -> tuple[str, str]:
+    """The categories of a run so long that a column is many steps: the darker, the more of these each has."""
+    names, shares = chart.categories[::-1], chart.shares(shown)[::-1]
+    cells = (np.nan_to_num(shares) * SHADES).round().astype(np.uint8)
+    grey = [(*SHARE, 255 * level // SHADES) for level in range(SHADES + 1)]
+    picture = _picture(
+        cells,
+        grey,
+        "cells",
+        "; ".join(f"{name}: {_known_mean(share):.0%}" for name, share in zip(names, shares, strict=True)),
+    )
+    places = [(1.0 - (i + 0.5) / len(names), escape(name)) for i, name in enumerate(names)]
+    levels = _base64(1 + np.round(np.nan_to_num(shares) * (LEVELS - 1)).astype(np.uint8))
+    items = ["<li><span>share of the steps of a column</span> <b></b></li>"]
+    data = f'"rows":{json.dumps(list(names))},"cells":"{levels}","scale":[0,1,0]'
+    return legend(items) + plot(chart.unit, picture, places, shown, max(60, 18 * len(names))), data
+
+
+def _known_mean(share: Array) -> float:
+    known = share[np.isfinite(share)]
+    return float(known.mean()) if known.size else 0.0
 
 
 def _map(rows: Map, shown: Columns) -> tuple[str, str, list[str]]:

@@ -53,15 +53,15 @@
     if (plot.series)
       return plot.series.map(({low, high}) => plot.words ? plot.words[low[column]] ?? "–" :
         high && high[column] !== low[column] ? `${number(low[column])} … ${number(high[column])}` : number(low[column]));
-    const at = plot.row * plot.count + column, node = `node ${plot.rows[plot.row]}: `;
+    const at = plot.row * plot.count + column, row = `${plot.rows[plot.row]}: `;
     if (plot.cells) {
       const [low, high, log] = plot.scale, part = (plot.cells[at] - 1) / 254;
       const value = log ? low * Math.pow(high / low, part) : low + (high - low) * part;
-      return [node + (plot.cells[at] ? "≈ " + number(Number(value.toPrecision(2))) : "not known")];
+      return [row + (plot.cells[at] ? "≈ " + number(Number(value.toPrecision(2))) : "not known")];
     }
     return [...plot.values].map((_, layer) => {
       const code = plot.codes[at] >> (2 * layer) & 3;
-      return node + (code & 1 ? "yes" : code & 2 ? "not known" : "no");
+      return row + (code & 1 ? "yes" : code & 2 ? "not known" : "no");
     });
   }
 

@@ -89,7 +89,9 @@ def _faults(account: Account) -> Iterator[str]:
 
 
 def ladder(account: Account) -> str:
-    """Every rung as a bar; with them, what this run came to."""
+    """Every rung as a bar; with them, what this run came to. Nothing where there is neither."""
+    if not account.rungs:
+        return ""
     highest = max((value for _, value in account.rungs), default=0.0) or 1.0
     rows = "".join(
         f'<tr{" class=own" * (name == THIS_RUN)}><th scope="row">{escape(name)}</th><td class="bar">'

@@ -41,9 +41,10 @@ def verdict_sentence(verdict: Verdict) -> str:
     """Whether the recording can be believed."""
     if not verdict.agrees:
         return f"This recording is not a true account of the run: {_what_is_wrong(verdict)}."
+    but = ", but for what the real sensors measured," if verdict.external else ""
     follows = (
-        "every number in it was computed again, independently of the nodes, and is what this network must give, to "
-        "within rounding"
+        f"every number in it{but} was computed again, independently of the nodes, and is what this network must give, "
+        "to within rounding"
     )
     if verdict.finished:
         return f"This recording can be believed: no message is missing, and {follows}."
@@ -82,7 +83,8 @@ def error_sentence(account: Account) -> str:
     if verdict.peak is None or not account.log.has_plant:
         return "How far off the estimates were is not known: real sensors measured, so nobody knows what was true."
     peak = verdict.peak
-    said = [f"The estimates of all nodes together were off by {brief(peak.size, 3)} at most, at step {peak.step}."]
+    by_it = "The" if verdict.agrees else "By what is recorded, the"
+    said = [f"{by_it} estimates of all nodes together were off by {brief(peak.size, 3)} at most, at step {peak.step}."]
     if account.mean_bound is not None:
         bound = float(account.mean_bound[-1])
         above = "" if verdict.peak.size <= bound else " This run was above that, as single runs may be."
