@@ -77,7 +77,14 @@ def figure(chart: Chart, shown: Columns, width: float) -> Figure:
         handles, labels = axes.get_legend_handles_labels()
         if len(labels) > 1 or isinstance(chart.rows, Raster):
             many = 4 if width > 5.0 else 2
-            drawing.legend(handles, labels, loc="outside upper left", ncols=min(many, len(labels)), columnspacing=1.2)
+            drawing.legend(
+                handles,
+                labels,
+                loc="outside upper left",
+                ncols=min(many, len(labels)),
+                columnspacing=1.2,
+                markerscale=2.0,
+            )
         return drawing
 
 
