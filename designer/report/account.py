@@ -13,7 +13,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.problem import White
+from agent.contract.problem.disturbance import White
 from designer.ladder import ladder_of
 from designer.replay import judge
 from designer.replay.log import Log, load
