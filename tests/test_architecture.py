@@ -47,7 +47,7 @@ ROOMS = {
     "designer.synthesis",
     "designer.simulation": "designer.model designer.workers",
     "designer.replay": "agent.contract.recording designer.model designer.proof",
-    "designer.report": "designer.ladder designer.replay",
+    "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.show": "agent.contract.recording",
     "designer.commands": "agent.commands designer.analysis designer.diagnosis designer.gain designer.ladder "
     "designer.problems designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
@@ -264,6 +264,8 @@ def loaded(modules: str) -> set[str]:
         # replay: nothing of the nodes' arithmetic, no network
         ("designer.replay",
          "agent.filter agent.inbox agent.roles agent.network.bus zenoh cvxpy clarabel scipy flint matplotlib"),
+        # a page of a report: no figures for papers
+        ("designer.report.page", "agent.filter agent.network zenoh cvxpy clarabel scipy flint matplotlib"),
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver

@@ -42,8 +42,9 @@ def reproduce_command(options: argparse.Namespace) -> int:
 
 def _write_figures(table: Reproduced, options: argparse.Namespace) -> list[Path]:
     from designer.report import figures, paper
+    from designer.reproduce import EXAMPLES
 
-    charts = paper.charts({name: table.computed[name].theorem2 for name in paper.EXAMPLES})
+    charts = paper.charts(*(table.computed[name].theorem2 for name in EXAMPLES))
     options.figures.mkdir(parents=True, exist_ok=True)
     drawings = figures.drawings(charts, stop=paper.STEPS)
     return figures.write(drawings, options.figures, kind=options.format or FORMATS[0], force=options.force)

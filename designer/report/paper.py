@@ -6,7 +6,6 @@ the modes of figure 2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,6 @@ from designer.report.chart import Chart
 from designer.report.pictures import errors, modes, outputs
 
 STEPS, SEED = 50, 0
-EXAMPLES = ("zhu2020-ideal", "zhu2020-lossy")
 
 
 class Run(NamedTuple):
@@ -50,9 +48,9 @@ def run(gains: Gains, *, steps: int = STEPS, seed: int = SEED) -> Run:
     return Run(problem, mode, z, z_tilde)
 
 
-def charts(gains: Mapping[str, Gains]) -> dict[str, Chart]:
-    """By their names, figure-2 to figure-6; `gains` of both examples by the names of their problems."""
-    ideal, lossy = (run(gains[name]) for name in EXAMPLES)
+def charts(example_1: Gains, example_2: Gains) -> dict[str, Chart]:
+    """By their names, figure-2 to figure-6."""
+    ideal, lossy = run(example_1), run(example_2)
     return {
         "figure-2": modes(lossy.problem, lossy.mode),
         "figure-3": _outputs(ideal),

@@ -9,12 +9,10 @@ import os
 import shutil
 import signal
 import subprocess
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 60.0  # seconds after which a browser that does not answer is ended
 FLAGS = [
     "--headless",
     "--no-sandbox",  # so that root may run it
@@ -41,7 +39,7 @@ class Page:
     """One tab. `requests` are the addresses that it asked for, `complaints` what it wrote on its console."""
 
     def __init__(self, write: Any, read: Any) -> None:
-        self._write, self._read, self._number, self._session = write, read, 0, ""
+        self._write, self._read, self._number, self._session, self._loaded = write, read, 0, "", False
         self.requests: list[str] = []
         self.complaints: list[str] = []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
@@ -72,7 +70,9 @@ class Page:
         return message
 
     def _note(self, method: str, of: dict[str, Any]) -> None:
-        if method == "Network.requestWillBeSent":
+        if method == "Page.loadEventFired":
+            self._loaded = True
+        elif method == "Network.requestWillBeSent":
             self.requests.append(of["request"]["url"])
         elif method == "Runtime.consoleAPICalled":
             self.complaints.append(str(of["args"]))
@@ -86,9 +86,10 @@ class Page:
         self.resize(width)
         theme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[theme])
+        self._loaded = False
         self.call("Page.navigate", url=file.resolve().as_uri())
-        while self.evaluate("document.readyState") != "complete":
-            pass
+        while not self._loaded:
+            self._next()
 
     def resize(self, width: int) -> None:
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
@@ -140,8 +141,6 @@ def browser(folder: Path) -> Iterator[Page]:
     )
     os.close(to_browser)
     os.close(from_browser)
-    overdue = threading.Timer(PATIENCE, os.killpg, (process.pid, signal.SIGKILL))
-    overdue.start()
     try:
         with open(commands, "wb") as write, open(answers, "rb") as read:
             page = Page(write, read)
@@ -149,7 +148,6 @@ def browser(folder: Path) -> Iterator[Page]:
             page.call("Browser.close")
             process.wait()
     finally:
-        overdue.cancel()
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()

@@ -1,163 +1,116 @@
-"""Pictures show what was recorded: the numbers in their lines are the recording's."""
+"""Figures for a paper: the recording's numbers, at the widths of journals, always the same."""
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from made_recordings import random_gains, random_problem, record, simulate
-from places import ROOT
+from places import GOLDEN
+from reports import account_of
 
 from agent.contract.errors import InputError
-from designer.replay.log import Log, load
 from designer.report import figures
-
-STEPS = 50
-GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.mcap"
-
-
-def make(folder: Path, *, ny: tuple[int, ...] = (1, 2, 1, 1), nz: int = 1, steps: int = STEPS) -> Path:
-    gains = random_gains(random_problem(3, ny=ny, nz=nz))
-    return record(folder / "run.mcap", gains, simulate(gains, steps=steps), steps=steps)
+from designer.report.account import Account
+from designer.report.chart import Chart
+from designer.report.pictures import pictures
+from designer.report.scales import columns
 
 
-def lines(axes: object, names: list[str]) -> dict[str, np.ndarray]:
-    """Label -> values, of the lines with these labels."""
-    return {line.get_label(): line.get_ydata() for line in axes.lines if line.get_label() in names}  # type: ignore[attr-defined]
+def drawn(account: Account) -> dict[str, Chart]:
+    return {chart.key: chart for chart in pictures(account)}
 
 
-@pytest.mark.parametrize("nz", [1, 3])
-def test_the_lines_are_the_recording(tmp_path: Path, nz: int) -> None:
-    log = load(make(tmp_path, nz=nz))
-    names = [f"node {name}" for name in log.gains.problem.node_names]
-    estimates = [rf"$\hat{{z}}$ of {name}" for name in names]
-    outputs, errors = figures.outputs_figure(log), figures.errors_figure(log)
-    assert len(outputs.axes) == len(errors.axes) == nz + 1
-    for row in range(nz):
-        shown = lines(outputs.axes[row], [*estimates, "$z$"])
-        np.testing.assert_array_equal(shown["$z$"], log.z[:, row])
-        wrong = lines(errors.axes[row], names)
-        assert len(shown) == len(names) + 1
-        assert len(wrong) == len(names)
-        for i, (name, estimate) in enumerate(zip(names, estimates, strict=True)):
-            np.testing.assert_array_equal(shown[estimate], log.z_hat[:, i * nz + row])
-            np.testing.assert_array_equal(wrong[name], log.z[:, row] - log.z_hat[:, i * nz + row])
-    np.testing.assert_array_equal(outputs.axes[-1].lines[0].get_ydata(), log.mode)
-    norms = [line.get_ydata() for line in errors.axes[-1].lines]
-    assert max(norms[0]) == norms[1][0], "the dot is the peak"
-    assert len(norms) == 2, "where gamma is not proved, no bound is drawn"
+def figure(account: Account, key: str, *, steps: int | None = None) -> object:
+    return figures.figure(drawn(account)[key], columns(0, steps or account.log.steps, 2000), 3.5).axes[0]
 
 
-def test_the_bound_is_drawn_where_gamma_is_proved() -> None:
-    log = load(GOLDEN)
-    figure = figures.errors_figure(log)
-    bound, norm, peak = (line.get_ydata() for line in figure.axes[-1].lines)
-    energy = np.square(log.w).sum()
-    assert bound[-1] == pytest.approx(log.gains.certificate.gamma * np.sqrt(energy), rel=1e-6)
-    assert (norm <= bound).all()
-    assert peak[0] == max(norm)
+def stairs(axes: object) -> dict[str, np.ndarray]:
+    """Label -> values, of what is drawn as steps."""
+    return {patch.get_label(): patch.get_data().values for patch in axes.patches}  # type: ignore[attr-defined]
 
 
-def test_the_caption_says_what_is_shown_and_a_note_what_is_not() -> None:
-    log = load(GOLDEN)
-    gamma = math.ceil(1e6 * log.gains.certificate.gamma) / 1e6
-    for figure in (figures.outputs_figure(log), figures.errors_figure(log)):
-        assert figure.get_supxlabel() == f"zhu2020-lossy, seed 2020, γ = {gamma:.6f}"
-        panel, strip = figure.axes
-        last = round(strip.get_xlim()[1])
-        assert panel.get_title("right").startswith(f"steps {last + 1} to {log.steps - 1}, where")
-        hidden = np.abs(np.hstack([log.z, log.z_hat])[last + 1 :]).max()
-        assert hidden <= 0.01 * np.abs(np.hstack([log.z, log.z_hat])).max()
+def test_the_steps_and_dots_are_the_recording(tmp_path: Path) -> None:
+    account = account_of(tmp_path)
+    axes = figure(account, "outputs")
+    (dots,) = axes.lines  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(dots.get_xydata(), np.column_stack([np.arange(50), account.log.z[:, 0]]))
+    assert dots.get_linestyle() == "None", "discrete values are not joined"
+    for i in range(4):
+        steps = stairs(axes)[rf"$\hat{{z}}$ of node n{i}"]
+        np.testing.assert_array_equal(steps, account.log.z_hat[:, i])
+    errors = stairs(figure(account, "errors"))
+    np.testing.assert_array_equal(errors["node n2"], account.log.z[:, 0] - account.log.z_hat[:, 2])
 
 
-def test_modes_are_a_staircase_where_few_steps_of_a_long_run_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = load(GOLDEN)
-    monkeypatch.setattr(figures, "STAIRS", log.steps - 1)
-    strip = figures.outputs_figure(log).axes[-1]
-    shown = round(strip.get_xlim()[1]) + 1
-    assert shown < figures.STAIRS
-    np.testing.assert_array_equal(strip.lines[0].get_ydata(), log.mode[:shown])
+def test_a_map_has_every_error(tmp_path: Path) -> None:
+    account = account_of(tmp_path, ny=(1,) * 8)
+    (image,) = figure(account, "error-map").images  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(image.get_array().T, account.sizes[:, account.ranking])
 
 
-@pytest.mark.parametrize("n", [2, 8])
-def test_nodes_that_coincide_are_told_apart(tmp_path: Path, n: int) -> None:
-    log = load(make(tmp_path, ny=(1,) * n, steps=200))
-    drawn = [line for line in figures.outputs_figure(log).axes[0].lines if line.get_label() != "$z$"]
-    assert len({line.get_marker() for line in drawn}) == n
-    assert all(line.get_linewidth() > after.get_linewidth() for line, after in pairwise(drawn))
-    assert max(len(line.get_markevery()) for line in drawn) <= figures.MARKED
+def test_axes_end_near_the_data(tmp_path: Path) -> None:
+    for account in (Account.of(GOLDEN / "zhu2020-lossy.mcap"), account_of(tmp_path)):
+        low, high = figure(account, "outputs").get_ylim()  # type: ignore[attr-defined]
+        values = np.hstack([account.log.z, account.log.z_hat])
+        assert low <= values.min() <= values.max() <= high
+        assert high - low < 1.1 * (values.max() - values.min())
 
 
-def test_ticks_cover_the_curves(tmp_path: Path) -> None:
-    for log in (load(GOLDEN), load(make(tmp_path, nz=3))):
-        for figure in (figures.outputs_figure(log), figures.errors_figure(log)):
-            for axes in figure.axes[:-1]:
-                ticks = axes.get_yticks()
-                values = np.concatenate([line.get_ydata() for line in axes.lines])
-                assert len(ticks) >= 4
-                assert ticks[0] <= values.min() < values.max() <= ticks[-1]
+def test_every_axis_has_a_label_with_a_unit_or_a_name(tmp_path: Path) -> None:
+    account = account_of(tmp_path, nz=2)
+    for key in drawn(account):
+        axes = figure(account, key)
+        assert axes.get_xlabel() == "step $k$"  # type: ignore[attr-defined]
+        label = axes.get_ylabel()  # type: ignore[attr-defined]
+        assert "dimensionless" in label or label in {"topology", "node", "relative gap"}, key
 
 
-def test_the_pictures_of_the_documents_are_small(tmp_path: Path) -> None:
-    assert all(path.stat().st_size < 100_000 for path in figures.write(GOLDEN, tmp_path) if path.suffix == ".svg")
-
-
-def test_every_node_stands_in_the_legend(tmp_path: Path) -> None:
-    log = load(make(tmp_path, ny=(1,) * 7))
-    nodes = [f"node n{i}" for i in range(7)]
-    estimates = ["$z$", *(rf"$\hat{{z}}$ of {node}" for node in nodes)]
-    for figure, expected in ((figures.outputs_figure(log), estimates), (figures.errors_figure(log), nodes)):
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == expected
-        assert figure.axes[-1].get_xlabel() == "step $k$"
-
-
-@pytest.mark.parametrize(("ny", "steps"), [((1,), 10), ((1,) * 30, 20), ((1, 1), 5000)])
-def test_files_are_written_and_always_the_same(tmp_path: Path, ny: tuple[int, ...], steps: int) -> None:
-    recording = make(tmp_path, ny=ny, steps=steps)
-    paths = figures.write(recording, tmp_path)
-    assert [path.name for path in paths] == ["run-outputs.svg", "run-outputs.png", "run-errors.svg", "run-errors.png"]
+@pytest.mark.parametrize("kind", ["pdf", "svg", "png"])
+def test_files_have_the_width_of_one_and_two_columns_and_are_always_the_same(tmp_path: Path, kind: str) -> None:
+    account = Account.of(GOLDEN / "zhu2020-lossy.mcap")
+    some = {key: chart for key, chart in drawn(account).items() if key == "outputs"}
+    drawings = figures.drawings(some, stop=account.settled)
+    drawings["topologies"] = lambda width: figures.topologies(account.log.gains.problem, width)
+    drawings["ladder"] = lambda width: figures.ladder(account.rungs, width)
+    paths = figures.write(drawings, tmp_path, kind=kind)
+    assert [path.name for path in paths[:2]] == [f"outputs-one-column.{kind}", f"outputs-two-columns.{kind}"]
+    for path in paths:
+        wanted = 3.5 if "one" in path.name else 7.16
+        assert width_of(path) == pytest.approx(wanted, abs=0.01), path.name
+        assert path.stat().st_size < 300_000
     before = [path.read_bytes() for path in paths]
-    assert before[0].startswith(b"<?xml")
-    assert before[1].startswith(b"\x89PNG")
-    assert max(map(len, before)) < 1_000_000
-    assert [path.read_bytes() for path in figures.write(recording, tmp_path, force=True)] == before
     with pytest.raises(InputError, match="--force"):
-        figures.write(recording, tmp_path)
+        figures.write(drawings, tmp_path, kind=kind)
+    assert [path.read_bytes() for path in figures.write(drawings, tmp_path, kind=kind, force=True)] == before
 
 
-def test_a_long_line_keeps_its_extremes() -> None:
-    values = np.random.default_rng(0).normal(size=100_000)
-    values[77_777] = 9.0
-    steps, kept = figures.thinned(values)
-    assert len(kept) <= figures.POINTS
-    assert (np.diff(steps) > 0).all()
-    np.testing.assert_array_equal(kept, values[steps.astype(int)])
-    assert (kept.min(), kept.max()) == (values.min(), 9.0)
+def width_of(path: Path) -> float:
+    """In inches, as the file itself says."""
+    data = path.read_bytes()
+    match path.suffix:
+        case ".png":
+            return int.from_bytes(data[16:20], "big") / figures.DPI
+        case ".svg":
+            found = re.search(rb'<svg [^>]*width="([\d.]+)pt"', data, flags=re.DOTALL)
+        case _:
+            found = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", data)
+    assert found is not None
+    return float(found[1]) / 72.0
 
 
-def test_a_line_with_holes_is_drawn_with_holes() -> None:
-    values = np.arange(10_000.0)
-    values[3000:4000] = np.nan
-    _, kept = figures.thinned(values)
-    assert np.isnan(kept).any()
-    assert np.nanmax(kept) == 9999.0
+def test_letters_are_embedded_in_a_pdf(tmp_path: Path) -> None:
+    account = account_of(tmp_path)
+    drawing = figures.figure(drawn(account)["outputs"], columns(0, 50, 2000), 3.5)
+    assert b"/FontFile2" in figures.rendered(drawing, "pdf")
 
 
-def test_a_cut_recording_can_be_drawn(tmp_path: Path) -> None:
-    gains = random_gains(random_problem(3))
-    sent = simulate(gains, steps=STEPS)
-    path = record(tmp_path / "run.mcap", gains, sent[:200], steps=STEPS, whole=False)
-    assert len(figures.write(path, tmp_path)) == 4
-
-
-def test_without_a_plant_there_are_no_errors_to_draw(tmp_path: Path) -> None:
-    gains = random_gains(random_problem(3))
-    real = {"n1": np.zeros((STEPS, 2))}
-    sent = simulate(gains, steps=STEPS, real_y=real)
-    path = record(tmp_path / "run.mcap", gains, sent, steps=STEPS, external="n1")
-    assert [path.name for path in figures.write(path, tmp_path)] == ["run-outputs.svg", "run-outputs.png"]
-    log: Log = load(path)
-    assert lines(figures.outputs_figure(log).axes[0], ["$z$"]) == {}
+def test_a_long_run_keeps_its_extremes(tmp_path: Path) -> None:
+    account = account_of(tmp_path, steps=200)
+    shown = columns(0, 200, 40)
+    axes = figures.figure(drawn(account)["outputs"], shown, 3.5).axes[0]
+    top = max(patch.get_data().values.max() for patch in axes.patches)
+    assert top == max(account.log.z.max(), account.log.z_hat.max())
+    (shares,) = figures.figure(drawn(account)["modes"], shown, 3.5).axes[0].images
+    np.testing.assert_allclose(shares.get_array().sum(axis=0), 1.0)

@@ -1,0 +1,135 @@
+"""The numbers of a report are those of the recording, and its bounds are proved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_recordings import observer_gains, random_gains, random_problem, real_problem, record, simulate
+from places import GOLDEN
+from reports import account_of, recorded
+
+from agent.contract import schedule
+from agent.contract.errors import RunBroken
+from agent.contract.gains import Gains
+from designer.problems import find
+from designer.proof.certificate import lyapunov_matrix
+from designer.proof.theorem1 import check
+from designer.report.account import Account, Chance, over_nodes, single_run_gamma
+from designer.synthesis import design
+
+GOLDEN_RUN = GOLDEN / "zhu2020-lossy.mcap"
+
+
+def test_errors_are_those_of_the_recording(tmp_path: Path) -> None:
+    account = account_of(tmp_path, nz=2)
+    log = account.log
+    for i in range(4):
+        np.testing.assert_array_equal(account.errors[:, i], log.z - log.z_hat[:, 2 * i : 2 * i + 2])
+    np.testing.assert_allclose(np.linalg.norm(account.sizes, axis=1), log.error_norms(), rtol=1e-14)
+    assert account.ranking[0] == np.argmax((account.sizes**2).sum(axis=0))
+    assert (np.diff(account.rms[account.ranking]) <= 0.0).all()
+
+
+def test_every_step_has_its_gaps_and_the_largest_are_the_verdicts(tmp_path: Path) -> None:
+    """Also where a node was moved: its step is the first one above the tolerance."""
+    account = Account.of(recorded(tmp_path, nudge=(17, "n1", 1e-3)))
+    for proof in account.verdict.proofs[:3]:
+        assert np.nanmax(account.trace.gaps[proof.number]) == proof.worst_gap
+    beyond = {step for gap in account.trace.gaps.values() for step in np.flatnonzero(gap > account.verdict.tolerance)}
+    assert account.verdict.first_divergence is not None
+    assert min(beyond) == account.verdict.first_divergence.step == 17
+
+
+def test_the_path_bound_of_every_step_is_the_one_that_replay_checks(tmp_path: Path) -> None:
+    """Its smallest margin is the verdict's; the error is below it at every step."""
+    account = Account.of(GOLDEN_RUN)
+    errors, bound = account.log.error_norms(), account.trace.path_bound
+    assert (errors <= bound * (1.0 + 1e-12) + 1e-15).all()
+    margins = 1.0 - errors[2:] / bound[2:]  # at step 1 it is an equality, w is one number
+    assert margins.min() == pytest.approx(account.verdict.path_margin, rel=1e-9)
+    energies = (account.log.w**2).sum(axis=1)
+    np.testing.assert_allclose(account.trace.energy_before[1:], np.cumsum(energies)[:-1], rtol=1e-14)
+
+
+def test_losses_and_messages_that_were_not_used_are_the_seeds(tmp_path: Path) -> None:
+    gains = observer_gains(real_problem(5, ny=(1, 2, 1)))
+    account = Account.of(record(tmp_path / "run.mcap", gains, simulate(gains, steps=50), steps=50))
+    losses, deliveries = schedule.Losses(gains.problem, seed=1), schedule.Deliveries(gains.problem, seed=1)
+    assert account.done_without[:-1].sum() > 0
+    for k in range(50):
+        np.testing.assert_array_equal(account.lost[k], 1.0 - losses.at(k))
+        if k < 49:
+            hears = gains.problem.topologies[account.log.mode[k]].adjacency > 0.0
+            np.testing.assert_array_equal(account.done_without[k], (hears & ~deliveries.at(k)).sum(axis=1))
+    assert np.isnan(account.done_without[-1]).all(), "the last step has no successor that could say it"
+
+
+def test_of_real_sensors_only_what_they_say_is_known(tmp_path: Path) -> None:
+    gains = random_gains(random_problem(3))
+    sent = simulate(gains, steps=20, real_y={"n1": np.zeros((20, 2))})
+    account = Account.of(record(tmp_path / "run.mcap", gains, sent, steps=20, external="n1"))
+    assert np.isnan(account.lost[:, 1]).all()
+    assert np.isfinite(account.lost[:, [0, 2, 3]]).all()
+    z_hat = account.log.z_hat
+    np.testing.assert_array_equal(account.errors[:, :, 0], z_hat - np.median(z_hat, axis=1)[:, None])
+    assert account.mean_bound is account.chance is None
+
+
+def test_a_run_settles_where_everything_stays_small() -> None:
+    account = Account.of(GOLDEN_RUN)
+    size = np.abs(np.hstack([account.log.z, account.log.z_hat])).max(axis=1)
+    assert account.settled < account.log.steps
+    assert size[account.settled :].max() <= 0.01 * size.max() < size[account.settled - 2]
+
+
+def test_one_that_does_not_settle_is_shown_whole(tmp_path: Path) -> None:
+    assert account_of(tmp_path).settled == 50
+
+
+def test_without_a_step_there_is_nothing_to_report(tmp_path: Path) -> None:
+    gains = random_gains(random_problem(3))
+    path = record(tmp_path / "run.mcap", gains, [], steps=50, whole=False)
+    with pytest.raises(RunBroken, match="holds no step of its run, so there is nothing to report"):
+        Account.of(path)
+
+
+def test_nodes_of_which_nothing_is_known_count_for_nothing() -> None:
+    values = np.array([[1.0, np.nan, 3.0], [np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(over_nodes(np.nanmedian, values), [2.0, np.nan])
+    np.testing.assert_array_equal(over_nodes(np.nanmax, values[:, :, None]), [[3.0], [np.nan]])
+
+
+# what single runs keep
+def test_a_lyapunov_certificate_proves_its_gamma_for_single_runs() -> None:
+    account = Account.of(GOLDEN_RUN)
+    gamma = account.log.gains.certificate.gamma
+    energy = (account.log.w[:-1] ** 2).sum()
+    assert account.chance is not None
+    assert account.chance == Chance(gamma, pytest.approx(energy, rel=1e-12))
+    assert account.chance.level(0.96) == pytest.approx(5.0 * gamma * np.sqrt(energy), rel=1e-12)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Gains:
+    return design(find("two-nodes"), method="exact")
+
+
+def test_of_an_exact_certificate_it_is_the_least_gamma_that_its_matrix_proves(exact: Gains) -> None:
+    """It is not below the exact gain, which says nothing of single runs; a thousandth less is proved false."""
+    gamma, P = single_run_gamma(exact), lyapunov_matrix(exact)
+    assert gamma is not None
+    assert exact.certificate.exact is not None
+    assert gamma >= exact.certificate.exact[0]
+    assert check(exact.problem, exact.K, exact.H, P=P, gamma=gamma).holds
+    refuted = check(exact.problem, exact.K, exact.H, P=P, gamma=0.999 * gamma)
+    assert refuted.failure is not None
+    assert "(18) fails" in refuted.failure
+
+
+def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: Gains) -> None:
+    assert exact.certificate.P is not None
+    turned = exact.certificate.model_copy(update={"P": {mode: -P for mode, P in exact.certificate.P.items()}})
+    assert single_run_gamma(exact.model_copy(update={"certificate": turned})) is None
+    assert account_of(tmp_path).chance is None
