@@ -110,7 +110,6 @@ def write_figures(account: Account, options: argparse.Namespace) -> tuple[list[P
     if options.data:
         numbers = {name: tables.of_chart(chart) for name, chart in charts.items()}
         numbers |= {"topologies": tables.of_topologies(problem), "ladder": tables.of_ladder(account.rungs)}
-    options.figures.mkdir(parents=True, exist_ok=True)
     written = figures.write(drawings, options.figures, kind=options.format or FORMATS[0], force=options.force)
     return written, tables.write(numbers, options.figures, force=options.force)
 

@@ -29,14 +29,18 @@ def add_reproduce(commands: Subcommands) -> None:
 def reproduce_command(options: argparse.Namespace) -> int:
     """`peakmesh reproduce`."""
     refuse_lone_options(options)
+    if options.figures is not None:
+        from designer.report import figures, paper
+
+        figures.paths(paper.NAMES, options.figures, kind=options.format or FORMATS[0], force=options.force)
     from designer.reproduce import reproduce
 
     table = reproduce(report=lambda said: print(said, file=sys.stderr))
-    figures = [] if options.figures is None else [str(path) for path in _write_figures(table, options)]
+    files = [] if options.figures is None else [str(path) for path in _write_figures(table, options)]
     if options.json:
-        print(json.dumps(table.document() | {"figures": figures}))
+        print(json.dumps(table.document() | {"figures": files}))
     else:
-        print("\n".join([table.text(), *([f"\n{len(figures)} figures in {options.figures}"] if figures else [])]))
+        print("\n".join([table.text(), *([f"\n{len(files)} figures in {options.figures}"] if files else [])]))
     return EXIT_GOOD
 
 
@@ -45,6 +49,5 @@ def _write_figures(table: Reproduced, options: argparse.Namespace) -> list[Path]
     from designer.reproduce import EXAMPLES
 
     charts = paper.charts(*(table.computed[name].theorem2 for name in EXAMPLES))
-    options.figures.mkdir(parents=True, exist_ok=True)
     drawings = figures.drawings(charts, stop=paper.STEPS)
     return figures.write(drawings, options.figures, kind=options.format or FORMATS[0], force=options.force)

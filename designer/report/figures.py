@@ -241,14 +241,21 @@ def drawings(charts: Mapping[str, Chart], *, stop: int) -> dict[str, Draw]:
     return {name: drawn(chart) for name, chart in charts.items()}
 
 
-def write(pictures: dict[str, Draw], folder: Path, *, kind: str, force: bool = False) -> list[Path]:
-    """Every picture at every width; nothing is written where one of the files is in the way."""
-    paths = {(name, width): folder / f"{name}-{width}.{kind}" for name in pictures for width in WIDTHS}
-    for path in paths.values():
+def paths(names: Iterable[str], folder: Path, *, kind: str, force: bool) -> dict[tuple[str, str], Path]:
+    """Where each picture goes at each width; makes the folder, and refuses where one of the files is in the way."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {(name, width): folder / f"{name}-{width}.{kind}" for name in names for width in WIDTHS}
+    for path in found.values():
         refuse_overwrite(path, force=force)
-    for (name, width), path in paths.items():
+    return found
+
+
+def write(pictures: Mapping[str, Draw], folder: Path, *, kind: str, force: bool = False) -> list[Path]:
+    """Every picture at every width; nothing is written where one of the files is in the way."""
+    found = paths(pictures, folder, kind=kind, force=force)
+    for (name, width), path in found.items():
         write_whole(path, rendered(pictures[name](WIDTHS[width]), kind), force=force)
-    return list(paths.values())
+    return list(found.values())
 
 
 def rendered(drawing: Figure, kind: str) -> bytes:

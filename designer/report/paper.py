@@ -20,6 +20,7 @@ from designer.report.chart import Chart
 from designer.report.pictures import errors, modes, outputs
 
 STEPS, SEED = 50, 0
+NAMES = tuple(f"figure-{number}" for number in range(2, 7))
 
 
 class Run(NamedTuple):
@@ -49,15 +50,16 @@ def run(gains: Gains, *, steps: int = STEPS, seed: int = SEED) -> Run:
 
 
 def charts(example_1: Gains, example_2: Gains) -> dict[str, Chart]:
-    """By their names, figure-2 to figure-6."""
+    """By their `NAMES`."""
     ideal, lossy = run(example_1), run(example_2)
-    return {
-        "figure-2": modes(lossy.problem, lossy.mode),
-        "figure-3": _outputs(ideal),
-        "figure-4": _outputs(lossy),
-        "figure-5": errors(ideal.problem, ideal.z_tilde)[0],
-        "figure-6": errors(lossy.problem, lossy.z_tilde)[0],
-    }
+    found = [
+        modes(lossy.problem, lossy.mode),
+        _outputs(ideal),
+        _outputs(lossy),
+        errors(ideal.problem, ideal.z_tilde)[0],
+        errors(lossy.problem, lossy.z_tilde)[0],
+    ]
+    return dict(zip(NAMES, found, strict=True))
 
 
 def _outputs(of: Run) -> Chart:

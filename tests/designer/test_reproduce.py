@@ -58,7 +58,7 @@ def test_every_row() -> None:
 
 def test_a_solver_that_is_not_there_is_said() -> None:
     values = dict.fromkeys(KEYS, 1.0) | {"scs": None, "consensus": None, "least_variance": None}
-    text = Reproduced({"zhu2020-ideal": values}).text()
+    text = Reproduced({"zhu2020-ideal": values}, {}).text()
     assert "no answer" in text
     assert "not stable" in text
     assert "two solvers" not in text

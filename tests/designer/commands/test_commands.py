@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from made_recordings import record, simulate
@@ -13,6 +14,7 @@ from agent.contract.gains import Gains
 from designer.cli import main
 from designer.lmi.lmi_design import METHODS
 from designer.problems import names
+from designer.reproduce import EXAMPLES, Reproduced
 from designer.search import effort
 from designer.synthesis import EXACT
 
@@ -115,13 +117,80 @@ def test_a_senseless_certificate_is_refused(folder: Path, gains: Gains, capsys: 
 
 
 def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
-    """Report writes both pictures as SVG and PNG, and does not replace them unasked."""
+    """One page, which it does not replace unasked, and never in place of the recording."""
     record(Path("run.mcap"), gains, simulate(gains, steps=30), steps=30)
     assert run("report", "run.mcap", "--json") == 0
-    pictures = [Path(name) for name in json.loads(capsys.readouterr().out)["pictures"]]
-    assert sorted(path.suffix for path in pictures) == [".png", ".png", ".svg", ".svg"]
-    assert all(path.stat().st_size > 1000 for path in pictures)
+    done = json.loads(capsys.readouterr().out)
+    assert done == {
+        "recording": "run.mcap", "agrees": True, "finished": True, "report": "run.html", "figures": [], "data": [],
+    }  # fmt: skip
+    assert Path("run.html").read_text().startswith("<!doctype html>")
     assert run("report", "run.mcap") == 2
+    assert "run.html exists already" in capsys.readouterr().err
+    assert run("report", "run.mcap", "-o", "run.mcap", "--force") == 2
+    assert "run.mcap is the recording itself" in capsys.readouterr().err
+    assert run("report", "run.mcap", "-o", ".") == 2
+    assert run("report", "run.mcap", "--force") == 0
+    assert "report     run.html\nverdict    the recording agrees" in capsys.readouterr().out
+
+
+def test_report_writes_figures_and_tables(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each at two widths, with the numbers behind each; the page where it is asked for."""
+    record(Path("run.mcap"), gains, simulate(gains, steps=10), steps=10)
+    assert run("report", "run.mcap", "--figures", "paper/run", "--format", "svg", "--data", "--json") == 0
+    done = json.loads(capsys.readouterr().out)
+    figures, data = (sorted(map(Path, done[key])) for key in ("figures", "data"))
+    assert sorted(Path("paper/run").iterdir()) == sorted([*figures, *data])
+    assert len(figures) == 2 * len(data) > 10
+    assert {path.name.partition(".")[2] for path in figures} == {"svg"}
+    assert {path.stem.removesuffix("-one-column").removesuffix("-two-columns") for path in figures} == {
+        path.stem for path in data
+    }
+    assert not Path("run.html").exists()
+    assert run("report", "run.mcap", "--figures", "paper/run", "--format", "svg", "-o", "page.html") == 2
+    assert not Path("page.html").exists()
+    assert run("report", "run.mcap", "--figures", "paper/run", "--format", "svg", "-o", "page.html", "--force") == 0
+    assert Path("page.html").exists()
+
+
+def test_report_refuses_in_a_sentence(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:
+    """A run without a step, options that say nothing, and a folder that is a file; nothing is written."""
+    empty = record(Path("run.mcap"), gains, [], steps=10, whole=False)
+    there = sorted(folder.iterdir())
+    for words, code, sentence in (
+        ([empty], 3, "run.mcap.part holds no step of its run, so there is nothing to report"),
+        ([empty, "--data"], 2, "--data says something of the figures; name a folder for them with --figures"),
+        ([empty, "--format", "pdf"], 2, "--format says something of the figures; name a folder"),
+        ([empty, "--figures", empty], 2, "run.mcap.part is a file; --figures takes a folder"),
+        ([empty, "--figures", "new"], 3, "holds no step of its run"),
+    ):
+        assert run("report", *words) == code
+        printed = capsys.readouterr()
+        assert (printed.out, printed.err.count("\n")) == ("", 1)
+        assert sentence in printed.err
+    assert sorted(folder.iterdir()) == there
+
+
+def test_reproduce_writes_the_papers_figures(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """2 to 6, at two widths; what is in the way is refused before anything is computed."""
+    golden = Gains.load(ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json")
+
+    def made(**_: object) -> Reproduced:
+        computed = {name: SimpleNamespace(theorem2=golden) for name in EXAMPLES}
+        return Reproduced({name: {} for name in EXAMPLES}, computed)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("designer.reproduce.reproduce", made)
+    assert run("reproduce", "--figures", "paper", "--format", "svg", "--json") == 0
+    figures = sorted(json.loads(capsys.readouterr().out)["figures"])
+    widths = ("one-column", "two-columns")
+    assert figures == [f"paper/figure-{number}-{width}.svg" for number in range(2, 7) for width in widths]
+    assert all(Path(path).stat().st_size > 1000 for path in figures)
+    monkeypatch.setattr("designer.reproduce.reproduce", None)
+    assert run("reproduce", "--figures", "paper", "--format", "svg") == 2
+    assert "figure-2-one-column.svg exists already" in capsys.readouterr().err
+    assert run("reproduce", "--format", "svg") == 2
 
 
 # Bad input: every command that reads a file, with every wrong file.
@@ -216,15 +285,15 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
 # The whole job, and what is kept of an old one.
 @pytest.mark.timeout(180)
 def test_demo(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One command designs, runs, replays and pictures the paper's second example; every file it names is there."""
+    """One command designs, runs, replays and reports the paper's second example; every file it names is there."""
     assert run("demo", "--steps", "50", "--json", "--method", "decomposed") == 0
     done = json.loads(capsys.readouterr().out)
     assert 0.34797 < done["design"]["gamma"] < 0.34801
     assert done["design"]["ladder"]["exact"][1] < done["design"]["gamma"]
     assert done["replay"]["agrees"]
     assert done["replay"]["finished"]
-    files = [done["design"]["output"], done["run"]["recording"], *done["pictures"]]
-    assert len(files) == 6
+    files = [done["design"]["output"], done["run"]["recording"], done["report"]]
+    assert [Path(file).name for file in files] == ["gains.json", "run.mcap", "report.html"]
     assert all(Path(file).is_file() for file in files)
 
 
