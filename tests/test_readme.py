@@ -62,6 +62,12 @@ def test_its_table_has_every_command(capsys: pytest.CaptureFixture[str]) -> None
     assert table == known
 
 
+def test_its_pictures_are_there_and_small() -> None:
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", README)
+    assert len(pictures) >= 2
+    assert all((ROOT / picture).stat().st_size < 100_000 for picture in pictures)
+
+
 def test_its_sensor_is_the_script() -> None:
     """The sensor in the README is docs/sensor.py to the letter."""
     (text,) = blocks("python")

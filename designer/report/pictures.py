@@ -117,7 +117,7 @@ def _bounds(account: Account) -> Chart:
         marks.append(Line("bound in the mean, γ", account.mean_bound, "mean"))
         about.append("γ bounds it in the mean over many runs: one run may be above it.")
     if account.chance is not None:
-        name = f"{CONFIDENCE:.0%} of all runs stay below at every step"
+        name = f"at least {CONFIDENCE:.0%} of such runs stay below at every step"
         marks.append(Level(name, account.chance.level(), "chance"))
     marks.append(Line("|z̃|, all nodes together", norms, "plant", "dotted steps"))
     highest = max(np.nanmax(mark.values, initial=0.0) for mark in marks if isinstance(mark, Line))

@@ -89,4 +89,5 @@
       topology.classList.toggle("lit", mode !== null && Number(topology.dataset.mode) === mode);
   }
   show(step);
+  addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((details) => { details.open = true; }));
 }

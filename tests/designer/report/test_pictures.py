@@ -67,7 +67,7 @@ def test_the_three_envelopes_are_drawn_where_gamma_is_proved(tmp_path: Path) -> 
     mean = account.log.gains.certificate.gamma * np.sqrt(np.cumsum(energies) - energies)
     np.testing.assert_allclose(shown["bound in the mean, γ"], mean, rtol=1e-12, atol=1e-16)
     np.testing.assert_array_equal(shown["this run's own bound, γ_path"], account.trace.path_bound)
-    assert (chance.name, chance.value > mean.max()) == ("95% of all runs stay below at every step", True)
+    assert (chance.name, chance.value > mean.max()) == ("at least 95% of such runs stay below at every step", True)
     unproved = drawn(account_of(tmp_path))["bounds"]
     assert list(lines(unproved)) == ["this run's own bound, γ_path", "|z̃|, all nodes together"]
     assert unproved.remark == "No γ is drawn: none is proved for these gains."

@@ -220,4 +220,5 @@ def test_it_can_be_printed(chromium: Page, files: dict[str, Path], kind: str) ->
     chromium.call("Emulation.setEmulatedMedia", media="print", features=[dark])
     assert chromium.evaluate("getComputedStyle(document.querySelector('.cursor')).display") == "none"
     assert chromium.evaluate("getComputedStyle(document.body).color") == "rgb(26, 26, 26)"
+    assert chromium.evaluate("Array.from(document.querySelectorAll('details')).every(details => details.open)")
     chromium.call("Emulation.setEmulatedMedia", media="", features=[])
