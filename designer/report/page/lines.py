@@ -16,6 +16,7 @@ from designer.report.scales import Columns, Scale, brief, brief_all
 
 PLOT = 210  # pixels
 CATEGORIES = 12  # that are named
+TICK_DIGITS = 8
 DOTTED = 150  # columns up to which dots have their full size
 
 
@@ -56,7 +57,7 @@ def _ticks(chart: Chart, scale: Scale) -> list[tuple[float, str]]:
     if chart.categories:
         names = [(float(place), escape(name)) for place, name in enumerate(chart.categories)]
         return names[:: max(1, len(names) // CATEGORIES)]
-    return [(tick, power(tick) if chart.log else brief(tick)) for tick in scale.ticks()]
+    return [(tick, power(tick) if chart.log else brief(tick, TICK_DIGITS)) for tick in scale.ticks()]
 
 
 def _across(scale: Scale, value: float, shown: Columns) -> str:

@@ -23,6 +23,7 @@ SHADES = 15  # of a raster's marks, where a column is many steps
 
 
 def rows_of(rows: Map | Raster, shown: Columns) -> tuple[str, str]:
+    """The legend with the picture, and the numbers for the pointer."""
     picture, data, items = (_map if isinstance(rows, Map) else _raster)(rows, shown)  # type: ignore[arg-type]
     n = len(rows.rows)
     height = n * (18 if n <= 12 else 12 if n <= 40 else 6)
@@ -35,14 +36,9 @@ def rows_of(rows: Map | Raster, shown: Columns) -> tuple[str, str]:
 def shares_of(chart: Chart, shown: Columns) -> tuple[str, str]:
     """The categories of a run so long that a column is many steps: the darker, the more of these each has."""
     names, shares = chart.categories[::-1], chart.shares(shown)[::-1]
-    cells = (np.nan_to_num(shares) * SHADES).round().astype(np.uint8)
     grey = [(*SHARE, 255 * level // SHADES) for level in range(SHADES + 1)]
-    picture = _picture(
-        cells,
-        grey,
-        "cells",
-        "; ".join(f"{name}: {_known_mean(share):.0%}" for name, share in zip(names, shares, strict=True)),
-    )
+    said = "; ".join(f"{name}: {_known_mean(share):.0%}" for name, share in zip(names, shares, strict=True))
+    picture = _picture((np.nan_to_num(shares) * SHADES).round().astype(np.uint8), grey, "cells", said)
     places = [(1.0 - (i + 0.5) / len(names), escape(name)) for i, name in enumerate(names)]
     levels = _base64(1 + np.round(np.nan_to_num(shares) * (LEVELS - 1)).astype(np.uint8))
     items = ["<li><span>share of the steps of a column</span> <b></b></li>"]
