@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_recordings import observer_gains, real_problem
+from places import GOLDEN
 from pydantic import BaseModel
 
 import agent
@@ -29,6 +30,7 @@ from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Sampl
 from designer import analysis, problems
 from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
 from designer.replay.central import Central
+from designer.report.account import Account
 
 BASES = {Frozen, Model, messages.Message}  # of which there are no instances
 LOSSY = problems.find("zhu2020-lossy")
@@ -305,7 +307,8 @@ def test_gains_of_another_problem_are_refused(gains: Gains) -> None:
 def caching_examples() -> dict[type, Any]:
     gains = observer_gains(real_problem(1, radius=1.02))
     bar, model = stacks(gains.problem), error_model(gains.problem, *stacked_gains(gains))
-    return {ErrorModel: model, Stacks: bar, Central: Central.of(gains)}
+    account = Account.of(GOLDEN / "zhu2020-lossy.mcap")
+    return {ErrorModel: model, Stacks: bar, Central: Central.of(gains), Account: account}
 
 
 def test_what_dataclasses_cache_does_not_outlive_a_change_of_fields() -> None:

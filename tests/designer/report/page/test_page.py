@@ -15,6 +15,7 @@ from made_recordings import random_gains, random_problem, record, simulate
 from places import GOLDEN
 from reports import account_of, recorded
 
+from designer.ladder import rounded_up
 from designer.report.account import Account
 from designer.report.page import CLOSE_UP, MOST_COLUMNS, page
 from designer.report.page.words import divergence_sentence, error_sentence, verdict_sentence
@@ -158,7 +159,8 @@ def test_an_honest_run_is_believed(golden: Account) -> None:
     assert verdict_sentence(golden.verdict) in text
     assert error_sentence(golden) in text
     assert "that is proved" in error_sentence(golden)
-    for fact in ("seed 2020", golden.log.gains.digest(), "peakmesh run gains.json --steps 60 --seed 2020", "0.347993"):
+    again, gamma = "peakmesh run gains.json --steps 60 --seed 2020", rounded_up(golden.log.gains.certificate.gamma)
+    for fact in ("seed 2020", golden.log.gains.digest(), again, f"γ, proved{gamma}"):
         assert fact in text
     assert text.count("✓ holds") == 5
 
