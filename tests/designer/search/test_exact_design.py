@@ -37,7 +37,8 @@ def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
-    monkeypatch.setattr(descent, "_FINE", (3e-4,))
+    for name, value in {"_FINE": (3e-4,), "_HORIZON": 10, "_LONGEST": 20}.items():
+        monkeypatch.setattr(descent, name, value)
     assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
     with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
         design_exact(alone(0.7), starts={"least variance": least_variance_gains(alone(0.7))})
