@@ -18,7 +18,7 @@ from agent.contract.messages import Message
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
 
-PATIENCE = 60.0  # seconds after which a wait of a test has failed
+PATIENCE = 300.0  # seconds after which a wait of a test has failed, on a busy machine too
 
 
 def program(*arguments: object) -> list[str]:
