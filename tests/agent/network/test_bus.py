@@ -19,7 +19,6 @@ from agent.network.configuration import Network
 from agent.network.words import Incoming, Peer, Replayed, RunClosed, Sample
 
 
-
 @pytest.fixture
 def coordinator() -> Iterator[Bus]:
     with Bus(Network(wait=PATIENCE), run="test", who=COORDINATOR) as bus:
