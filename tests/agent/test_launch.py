@@ -9,6 +9,7 @@ import sys
 import threading
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 from made_recordings import observer_gains, real_problem, simulate
@@ -48,36 +49,50 @@ def test_run_and_replay_agree(gains_path: Path, tmp_path: Path) -> None:
     assert (verdict["steps"], verdict["missing"], verdict["duplicates"]) == (80, 0, 0)
 
 
-def test_same_seed_same_numbers(gains_path: Path, tmp_path: Path) -> None:
-    """Neither load nor window changes a bit of any message; another seed does."""
-    run_here(gains_path, tmp_path / "calm.mcap", steps=120, window=32)
+class Run(NamedTuple):
+    """A run that has ended well."""
+
+    gains_path: Path
+    recording: Path
+    steps: int
+    seed: int
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Of a network with seen losses, lossy links, unbiased gains and an unstable plant."""
+    folder = tmp_path_factory.mktemp("real")
+    run = Run(folder / "gains.json", folder / "run.mcap", steps=100, seed=3)
+    observer_gains(real_problem(5, radius=1.02, ny=(1, 2, 1))).save(run.gains_path)
+    run_here(run.gains_path, run.recording, steps=run.steps, seed=run.seed, window=32)
+    return run
+
+
+def test_same_seed_same_numbers(real: Run, tmp_path: Path) -> None:
+    """Neither load nor window changes a bit of any message."""
     burn = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(4)]
+
+    def load(word: dict[str, Any]) -> None:
+        if "started" in word:
+            for process in burn:
+                thaw(process.pid)
+
     try:
-        run_here(gains_path, tmp_path / "busy.mcap", steps=120, window=1)
+        for process in burn:
+            freeze(process.pid)
+        run_here(real.gains_path, tmp_path / "busy.mcap", heed=load, steps=real.steps, seed=real.seed, window=1)
     finally:
         for process in burn:
             process.kill()
             process.wait()
-    run_here(gains_path, tmp_path / "other.mcap", steps=120, window=5, seed=2)
-    calm, busy, other = (numbers_of(tmp_path / f"{name}.mcap") for name in ("calm", "busy", "other"))
-    assert calm == busy
-    assert calm.keys() == other.keys()
-    assert calm != other
+    assert numbers_of(tmp_path / "busy.mcap") == numbers_of(real.recording)
 
 
-def test_a_real_network_runs_and_is_replayed(tmp_path: Path) -> None:
-    """Seen losses, lossy links, unbiased gains, an unstable plant: every process does what the model says.
-
-    A second run of the seed sends the same messages bit for bit.
-    """
-    problem, steps = real_problem(5, radius=1.02, ny=(1, 2, 1)), 100
-    gains_path = tmp_path / "gains.json"
-    observer_gains(problem).save(gains_path)
-    for name, window in (("first", 32), ("again", 2)):
-        run_here(gains_path, tmp_path / f"{name}.mcap", steps=steps, seed=3, window=window)
-    payloads, again = (numbers_of(tmp_path / f"{name}.mcap") for name in ("first", "again"))
-    assert payloads == again
-    verdict = replay(tmp_path / "first.mcap")
+def test_a_real_network_runs_and_is_replayed(real: Run) -> None:
+    """Every process does what the model says."""
+    gains, steps = Gains.load(real.gains_path), real.steps
+    problem, payloads = gains.problem, numbers_of(real.recording)
+    verdict = replay(real.recording)
     assert verdict.exit_code == 0, verdict.text()
     assert all(proof.holds and proof.compared for proof in verdict.proofs)
     found = {key: json.loads(payload) for key, payload in payloads.items()}
@@ -95,7 +110,7 @@ def test_a_real_network_runs_and_is_replayed(tmp_path: Path) -> None:
     later = [(name, document) for name, document in estimates if document["step"]]
     unheard = [document for name, document in later if len(document["heard"]) < neighbours[document["mode"], name]]
     assert len(unheard) > 0.1 * steps
-    for message in simulate(Gains.load(gains_path), steps=steps, seed=3):  # the tests' own plant and nodes
+    for message in simulate(gains, steps=steps, seed=real.seed):  # the tests' own plant and nodes
         if message.topic != "event":
             for key, expected in message.document.items():
                 told = found[message.topic, message.document["step"]][key]
@@ -103,16 +118,19 @@ def test_a_real_network_runs_and_is_replayed(tmp_path: Path) -> None:
                 assert told == (expected if same else pytest.approx(expected, rel=1e-12, abs=1e-12))
 
 
-def test_two_runs_at_once(gains_path: Path, tmp_path: Path) -> None:
-    """Two runs on one machine do not disturb each other, though they have the same name and gains."""
-    with started("run", gains_path, "--steps", 60, "--seed", 1, "-o", tmp_path / "first.mcap") as first:
-        run_here(gains_path, tmp_path / "second.mcap", steps=60, seed=2)
+def test_two_runs_at_once(pair_path: Path, tmp_path: Path) -> None:
+    """Two runs on one machine do not disturb each other, though they have the same gains; other seed, other numbers."""
+    with started("run", pair_path, "--steps", 60, "--seed", 1, "-o", tmp_path / "first.mcap") as first:
+        run_here(pair_path, tmp_path / "second.mcap", steps=60, seed=2)
         assert first.wait(PATIENCE) == 0
-    for name in ("first", "second"):
-        assert replay(tmp_path / f"{name}.mcap").exit_code == 0
+    paths = [tmp_path / f"{name}.mcap" for name in ("first", "second")]
+    assert [replay(path).exit_code for path in paths] == [0, 0]
+    ours, theirs = map(numbers_of, paths)
+    assert ours.keys() == theirs.keys()
+    assert ours != theirs
 
 
-def test_frozen_recorder_slows_the_run(gains_path: Path, tmp_path: Path) -> None:
+def test_frozen_recorder_slows_the_run(pair_path: Path, tmp_path: Path) -> None:
     """A recorder that stands still for two seconds holds a lock-step run up, and loses nothing from it."""
 
     def freeze_for_two_seconds() -> None:
@@ -121,35 +139,35 @@ def test_frozen_recorder_slows_the_run(gains_path: Path, tmp_path: Path) -> None
         threading.Timer(2.0, thaw, [recorder]).start()
 
     recording = tmp_path / "run.mcap"
-    run_here(gains_path, recording, at=10, do=freeze_for_two_seconds, steps=400, window=8)
+    run_here(pair_path, recording, at=10, do=freeze_for_two_seconds, steps=400, window=8)
     times = [message.log_time for message in logged(recording)]
     assert max(later - earlier for earlier, later in pairwise(times)) > 1.5e9  # it did stand still
     assert replay(recording).exit_code == 0
 
 
 def test_files_of_the_current_folder_are_not_imported(
-    gains_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An agent.py or queue.py that happens to lie where the run is started has no part in it."""
     for name in ("agent.py", "queue.py"):
         (tmp_path / name).write_text("raise SystemExit('imported')\n")
     monkeypatch.chdir(tmp_path)
-    assert run_here(gains_path, tmp_path / "run.mcap", steps=5)["missing"] == 0
+    assert run_here(pair_path, tmp_path / "run.mcap", steps=5)["missing"] == 0
 
 
-def test_existing_recording_is_kept(gains_path: Path, tmp_path: Path) -> None:
+def test_existing_recording_is_kept(pair_path: Path, tmp_path: Path) -> None:
     """A recording that exists is not replaced: exit 2, and not a byte of it changes."""
     recording = tmp_path / "run.mcap"
     recording.write_bytes(b"precious")
-    done = peakmesh("run", gains_path, "--steps", 5, "-o", recording)
+    done = peakmesh("run", pair_path, "--steps", 5, "-o", recording)
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert recording.read_bytes() == b"precious"
 
 
-def test_child_that_cannot_start_is_reported(gains_path: Path, tmp_path: Path) -> None:
+def test_child_that_cannot_start_is_reported(pair_path: Path, tmp_path: Path) -> None:
     """A role that fails before the start ends the run at once with its own sentence."""
     (tmp_path / "run.mcap.part").write_bytes(b"left over")
     with pytest.raises(InputError, match=r"run\.mcap\.part exists already"):
-        run_here(gains_path, tmp_path / "run.mcap", steps=5)
+        run_here(pair_path, tmp_path / "run.mcap", steps=5)
     assert roles_left() == {}

@@ -10,14 +10,9 @@ from typing import Any
 
 from made_recordings import observer_gains, real_problem
 from places import ROOT
-from runs import (
-    PATIENCE,
-    logged,
-)
+from runs import PATIENCE, logged, run_here
 
 from agent.contract.gains import Gains
-from agent.launch import launch
-from agent.plan import Plan
 from designer.replay import replay
 
 SENSOR = ROOT / "docs" / "sensor.py"
@@ -31,19 +26,10 @@ def measured_by(
 
     def start_sensor(word: dict[str, Any]) -> None:
         if "listening" in word:
-            sensor.append(subprocess.Popen([sys.executable, script, "own", node, word["listening"][0]]))
+            sensor.append(subprocess.Popen([sys.executable, script, "test", node, word["listening"][0]]))
 
     try:
-        summary = launch(
-            gains_path,
-            Gains.load(gains_path),
-            Plan(steps=steps, seed=1, external=(node,)),
-            run="own",
-            recording=recording,
-            force=False,
-            wait=PATIENCE,
-            report=start_sensor,
-        )
+        summary = run_here(gains_path, recording, heed=start_sensor, steps=steps, external=(node,))
         assert sensor[0].wait(PATIENCE) == 0  # it ends with the run
     finally:
         for process in sensor:
@@ -55,13 +41,13 @@ def measured_by(
     return [(document["step"], document["y"]) for document in documents]
 
 
-def test_sensor_of_ones_own(gains_path: Path, tmp_path: Path, gains: Gains) -> None:
+def test_sensor_of_ones_own(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
     """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
     lines = [line for line in SENSOR.read_text().splitlines() if line.strip()]
     assert len(lines) < 20
     assert not any("peakmesh import" in line or "import agent" in line for line in lines)
-    name = gains.problem.node_names[0]
-    measured = measured_by(SENSOR, gains_path, tmp_path / "run.mcap", node=name, steps=60)
+    name = pair.problem.node_names[0]
+    measured = measured_by(SENSOR, pair_path, tmp_path / "run.mcap", node=name, steps=60)
     assert measured == [(k, [0.0]) for k in range(60)]
 
 
