@@ -33,9 +33,9 @@ def ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a cluster with two workers, each a process."""
+    """The address of a cluster with two workers, each a process; it costs time while it is idle too."""
     import dask
     from distributed import LocalCluster
 

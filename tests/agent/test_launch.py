@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -56,16 +57,28 @@ class Run(NamedTuple):
     recording: Path
     steps: int
     seed: int
+    summary: dict[str, Any]
 
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Of a network with seen losses, lossy links, unbiased gains and an unstable plant."""
-    folder = tmp_path_factory.mktemp("real")
-    run = Run(folder / "gains.json", folder / "run.mcap", steps=100, seed=3)
-    observer_gains(real_problem(5, radius=1.02, ny=(1, 2, 1))).save(run.gains_path)
-    run_here(run.gains_path, run.recording, steps=run.steps, seed=run.seed, window=32)
-    return run
+    """Of a network with seen losses, lossy links, unbiased gains and an unstable plant.
+
+    It is started in a folder where an agent.py and a queue.py lie.
+    """
+    folder, steps, seed = tmp_path_factory.mktemp("real"), 100, 3
+    gains_path, recording = folder / "gains.json", folder / "run.mcap"
+    observer_gains(real_problem(5, radius=1.02, ny=(1, 2, 1))).save(gains_path)
+    for name in ("agent.py", "queue.py"):
+        (folder / name).write_text("raise SystemExit('imported')\n")
+    with contextlib.chdir(folder):
+        summary = run_here(gains_path, recording, steps=steps, seed=seed, window=32)
+    return Run(gains_path, recording, steps, seed, summary)
+
+
+def test_files_of_the_current_folder_are_not_imported(real: Run) -> None:
+    """An agent.py or queue.py that happens to lie where the run is started has no part in it."""
+    assert (real.summary["steps"], real.summary["missing"]) == (real.steps, 0)
 
 
 def test_same_seed_same_numbers(real: Run, tmp_path: Path) -> None:
@@ -118,10 +131,10 @@ def test_a_real_network_runs_and_is_replayed(real: Run) -> None:
                 assert told == (expected if same else pytest.approx(expected, rel=1e-12, abs=1e-12))
 
 
-def test_two_runs_at_once(pair_path: Path, tmp_path: Path) -> None:
+def test_two_runs_at_once(lone_path: Path, tmp_path: Path) -> None:
     """Two runs on one machine do not disturb each other, though they have the same gains; other seed, other numbers."""
-    with started("run", pair_path, "--steps", 60, "--seed", 1, "-o", tmp_path / "first.mcap") as first:
-        run_here(pair_path, tmp_path / "second.mcap", steps=60, seed=2)
+    with started("run", lone_path, "--steps", 60, "--seed", 1, "-o", tmp_path / "first.mcap") as first:
+        run_here(lone_path, tmp_path / "second.mcap", steps=60, seed=2)
         assert first.wait(PATIENCE) == 0
     paths = [tmp_path / f"{name}.mcap" for name in ("first", "second")]
     assert [replay(path).exit_code for path in paths] == [0, 0]
@@ -130,7 +143,7 @@ def test_two_runs_at_once(pair_path: Path, tmp_path: Path) -> None:
     assert ours != theirs
 
 
-def test_frozen_recorder_slows_the_run(pair_path: Path, tmp_path: Path) -> None:
+def test_frozen_recorder_slows_the_run(lone_path: Path, tmp_path: Path) -> None:
     """A recorder that stands still for two seconds holds a lock-step run up, and loses nothing from it."""
 
     def freeze_for_two_seconds() -> None:
@@ -139,35 +152,25 @@ def test_frozen_recorder_slows_the_run(pair_path: Path, tmp_path: Path) -> None:
         threading.Timer(2.0, thaw, [recorder]).start()
 
     recording = tmp_path / "run.mcap"
-    run_here(pair_path, recording, at=10, do=freeze_for_two_seconds, steps=400, window=8)
+    run_here(lone_path, recording, at=10, do=freeze_for_two_seconds, steps=400, window=8)
     times = [message.log_time for message in logged(recording)]
     assert max(later - earlier for earlier, later in pairwise(times)) > 1.5e9  # it did stand still
     assert replay(recording).exit_code == 0
 
 
-def test_files_of_the_current_folder_are_not_imported(
-    pair_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An agent.py or queue.py that happens to lie where the run is started has no part in it."""
-    for name in ("agent.py", "queue.py"):
-        (tmp_path / name).write_text("raise SystemExit('imported')\n")
-    monkeypatch.chdir(tmp_path)
-    assert run_here(pair_path, tmp_path / "run.mcap", steps=5)["missing"] == 0
-
-
-def test_existing_recording_is_kept(pair_path: Path, tmp_path: Path) -> None:
+def test_existing_recording_is_kept(lone_path: Path, tmp_path: Path) -> None:
     """A recording that exists is not replaced: exit 2, and not a byte of it changes."""
     recording = tmp_path / "run.mcap"
     recording.write_bytes(b"precious")
-    done = peakmesh("run", pair_path, "--steps", 5, "-o", recording)
+    done = peakmesh("run", lone_path, "--steps", 5, "-o", recording)
     assert done.returncode == 2
     assert "exists already" in done.stderr
     assert recording.read_bytes() == b"precious"
 
 
-def test_child_that_cannot_start_is_reported(pair_path: Path, tmp_path: Path) -> None:
+def test_child_that_cannot_start_is_reported(lone_path: Path, tmp_path: Path) -> None:
     """A role that fails before the start ends the run at once with its own sentence."""
     (tmp_path / "run.mcap.part").write_bytes(b"left over")
     with pytest.raises(InputError, match=r"run\.mcap\.part exists already"):
-        run_here(pair_path, tmp_path / "run.mcap", steps=5)
+        run_here(lone_path, tmp_path / "run.mcap", steps=5)
     assert roles_left() == {}

@@ -53,11 +53,11 @@ def test_sensor_of_ones_own(pair_path: Path, tmp_path: Path, pair: Gains) -> Non
 
 def test_sensor_that_has_nothing_to_say(tmp_path: Path) -> None:
     """At every third step it publishes [], which a node that sees its losses takes for what it is."""
-    problem, script, reading = real_problem(5, radius=1.02, ny=(1, 2, 1)), tmp_path / "sensor.py", '"y": [0.0]'
-    assert problem.nodes[2].seen
+    problem, script, reading = real_problem(5, radius=1.02, ny=(1, 1)), tmp_path / "sensor.py", '"y": [0.0]'
+    assert problem.nodes[1].seen
     observer_gains(problem).save(tmp_path / "gains.json")
     text = SENSOR.read_text()
     assert text.count(reading) == 1
     script.write_text(text.replace(reading, '"y": [0.5] if json.loads(mode)["step"] % 3 else []'))
-    measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n2", steps=30)
+    measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n1", steps=30)
     assert measured == [(k, [0.5] if k % 3 else []) for k in range(30)]

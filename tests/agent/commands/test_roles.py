@@ -51,11 +51,11 @@ def test_other_gains_are_refused(pair_path: Path, tmp_path: Path, pair: Gains) -
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_port_in_use(pair_path: Path) -> None:
+def test_port_in_use(lone_path: Path) -> None:
     """A port that is taken: exit 2, the address and the cause."""
-    with started("coordinator", pair_path, "--listen", "tcp/127.0.0.1:0") as first:
+    with started("coordinator", lone_path, "--listen", "tcp/127.0.0.1:0") as first:
         address = line_with(first, "listening at").split()[-1]
-        second = peakmesh("coordinator", pair_path, "--listen", address)
+        second = peakmesh("coordinator", lone_path, "--listen", address)
     assert second.returncode == 2
     assert second.stderr == f"peakmesh: cannot listen on {address}: the port is in use; port 0 takes a free one\n"
 
@@ -71,9 +71,9 @@ def test_nobody_listens(pair_path: Path, pair: Gains) -> None:
     )
 
 
-def test_missing_participants_are_named(pair_path: Path) -> None:
+def test_missing_participants_are_named(lone_path: Path) -> None:
     """A coordinator to whom nobody comes says who is missing: exit 3."""
-    done = peakmesh("coordinator", pair_path, "--wait", "0.5")
+    done = peakmesh("coordinator", lone_path, "--wait", "0.5")
     assert done.returncode == 3
     assert 'node "' in done.stderr
     assert "the plant and the recorder did not join the run within 0.5 s" in done.stderr
