@@ -4,5 +4,5 @@ the rooms       contract: what both packages share, files, keys and messages; ne
                 roles: node, plant, coordinator, recorder; commands: what the program does
 a node's step   inbox: what must be there before it; filter: eqs. (4) and (5)
 a whole run     plan: what the coordinator decides; receipts: what the recorder has; launch: every role on this machine
-the machine     cli: the program
+the machine     cli: the program; signals: what asks it to end
 """

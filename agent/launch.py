@@ -2,7 +2,8 @@
 
 A child reads the coordinator's address from its standard input, a pipe that the launcher holds open: its end
 tells the child that the launcher is gone. Children have sessions of their own, so Ctrl-C reaches the launcher
-alone, which has the coordinator end the run in order.
+alone, which has the coordinator end the run in order. Started with SIGINT ignored, it leaves that so, and its
+children inherit it; SIGTERM ends the run all the same.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
 from agent.plan import Plan
+from agent.signals import heed, restore
 
-RECORDER_SECONDS = 10.0  # after the coordinator has gone, the recorder has so long to close before it is killed
+RECORDER_SECONDS = 60.0  # after the coordinator has gone, the recorder has so long to close before it is killed
 FAREWELL_SECONDS = 1.0  # after the recorder has gone, the others have so long
 
 
@@ -102,14 +104,7 @@ class _Crew:
         self._children: dict[str, Child] = {}
         self._signal: int | None = None
         self._failed: str | None = None  # who ended badly before the run had started
-        self._before = {
-            number: signal.signal(number, handler)
-            for number, handler in (
-                (signal.SIGINT, self._on_signal),
-                (signal.SIGTERM, self._on_signal),
-                (signal.SIGCHLD, self._on_exit),
-            )
-        }
+        self._before = heed(self._on_signal) | {signal.SIGCHLD: signal.signal(signal.SIGCHLD, self._on_exit)}
 
     def start(self, who: str, command: list[str]) -> None:
         said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the crew
@@ -206,8 +201,7 @@ class _Crew:
             for stream in (child.process.stdin, child.process.stdout, child.said):
                 if stream is not None:
                     _close(stream)
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        restore(self._before)
 
 
 def _wait_or_kill(process: subprocess.Popen[bytes], seconds: float) -> None:

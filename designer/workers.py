@@ -17,7 +17,7 @@ from typing import TypeVar
 
 from agent.contract.errors import InputError, RunBroken
 
-PATIENCE = 5  # seconds for a Dask scheduler to answer, and for the first of its workers to be there
+PATIENCE = 30  # seconds for a Dask scheduler to answer, and for the first of its workers to be there
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the program does; two tests at a time take both cores
@@ -24,9 +25,17 @@ def gains() -> Gains:
     return random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """SIGINT has its effect, here and in processes started here, though whoever started the tests may ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of a cluster with two workers, each a process."""
+    """The address of a cluster with two workers, each a process; it costs time while it is idle too."""
     import dask
     from distributed import LocalCluster
 

@@ -38,7 +38,7 @@ def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] 
     add_plan_options(parser)
     add_output_options(parser, *output)
     parser.add_argument(
-        "--wait", type=positive, default=30.0, metavar="S", help="seconds to wait for all to start (30)"
+        "--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for all to start (60)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 

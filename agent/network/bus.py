@@ -15,7 +15,6 @@ What roles talk to. What makes it lose nothing:
 from __future__ import annotations
 
 import math
-import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from types import FrameType, TracebackType
@@ -30,10 +29,12 @@ from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
 from agent.network.words import Incoming, Peer, Replayed, RunClosed, Sample, Words
+from agent.signals import heed, restore
 
-REPLAY_SECONDS = 1.0  # how long the recorder waits for what it asks for at the end
-CLOSE_SECONDS = 10.0  # how long everybody else waits for the recorder to close, as long as it is there
-LEAVE_SECONDS = 1.0  # how long one waits for the others to have gone
+# Seconds of silence that end a wait. Silence, because on a busy machine everything takes long, but goes on.
+REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
+CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
+LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
 
 T = TypeVar("T")
 Word = TypeVar("Word", Control, Acknowledged, Ready)
@@ -53,7 +54,7 @@ class Bus:
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._session = Session(network, run=run, hand_over=self._words.put)
-        self._handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._handlers = heed(self._on_signal)
 
     def __enter__(self) -> Self:
         return self
@@ -64,8 +65,7 @@ class Bus:
         try:
             self._session.close()
         finally:
-            for number, handler in self._handlers.items():
-                signal.signal(number, handler)
+            restore(self._handlers)
 
     def locators(self) -> list[str]:
         """The addresses at which others can connect."""
@@ -211,7 +211,7 @@ class Bus:
 
     def request_replay(self, who: str, *, first: int) -> None:
         """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
-        self._session.request_replay(who, first=first, seconds=REPLAY_SECONDS)
+        self._session.request_replay(who, first=first, seconds=CLOSE_SECONDS)
 
     def _say(self, topic: str, word: BaseModel) -> None:
         self._session.say(topic, word.model_dump_json().encode())
@@ -219,11 +219,9 @@ class Bus:
     # End together.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
         """Samples that are still to come, until everybody in `whos` has answered a request for replay."""
-        self._leaving = True
         waiting = set(whos)
-        deadline = time.monotonic() + REPLAY_SECONDS
-        while waiting and time.monotonic() < deadline:
-            match self._words.take(deadline):
+        for word in self._until(lambda: not waiting, silence=REPLAY_SECONDS):
+            match word:
                 case Sample() as sample:
                     yield sample
                 case Replayed(who=who):
@@ -231,20 +229,26 @@ class Bus:
 
     def wait_for_close(self) -> Acknowledged | None:
         """Answer replays until the recorder has closed the recording; None where it has not."""
-        words = self._words
-        self._until(lambda: self._last_word is not None or RECORDER not in words.present, seconds=CLOSE_SECONDS)
+        present = self._words.present
+        for _ in self._until(lambda: self._last_word is not None or RECORDER not in present, silence=CLOSE_SECONDS):
+            pass
         return self._last_word
 
     def wait_until_gone(self, whos: Iterable[str]) -> None:
         """Stay until they have gone, so that our last word is sure to have reached them; but not for long."""
-        names = set(whos)
-        self._until(lambda: not names & self._words.present, seconds=LEAVE_SECONDS)
+        names, present = set(whos), self._words.present
+        for _ in self._until(lambda: not names & present, silence=LEAVE_SECONDS):
+            pass
 
-    def _until(self, condition: Callable[[], bool], *, seconds: float) -> None:
+    def _until(self, condition: Callable[[], bool], *, silence: float) -> Iterator[Incoming | None]:
+        """What comes until the condition holds, or for `silence` seconds nothing has come; None as from `take`."""
         self._leaving = True
-        deadline = time.monotonic() + seconds
-        while not condition() and time.monotonic() < deadline:
-            self._words.take(deadline)
+        while not condition():
+            before = self._words.taken
+            word = self._words.take(time.monotonic() + silence)
+            if self._words.taken == before:
+                return
+            yield word
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._words.put(lambda: self._interrupt(number))

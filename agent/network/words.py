@@ -58,6 +58,7 @@ class Words:
     def __init__(self, who: str) -> None:
         self.present: set[str] = set()  # whose token is there
         self.alone = True  # nobody else of this run has been heard
+        self.taken = 0  # duties done so far
         self._who = who
         self._queue: SimpleQueue[Duty] = SimpleQueue()
         self._early: list[Incoming] = []  # what came while something else was waited for
@@ -76,6 +77,7 @@ class Words:
             word = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
         except Empty:
             return None
+        self.taken += 1
         if word is not None and not (isinstance(word, Peer) and word.who == self._who):
             self.alone = False
         match word:

@@ -143,16 +143,20 @@ class Conductor:
         self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=self._bus.who, detail=detail))
 
     def _wait_for_progress(self) -> None:
-        """Until the recorder holds one more step, the deadline passes, or somebody is lost."""
+        """Until the recorder holds one more step, the deadline passes, or somebody is lost.
+
+        The recorder alone knows what is late: where it has said nothing, it is given as long again to say so.
+        """
         deadline = time.monotonic() + self._plan.deadline
-        before, recorder_speaks = self.complete, False
+        before, silent = self.complete, True
         while self.complete == before:
-            if time.monotonic() >= deadline:
-                raise RunBroken(self._what_is_late(recorder_speaks))
-            match self._bus.receive(timeout=deadline - time.monotonic()):
+            left = deadline + (self._plan.deadline if silent else 0.0) - time.monotonic()
+            if left <= 0.0:
+                raise RunBroken(self._what_is_late(silent))
+            match self._bus.receive(timeout=left):
                 case Acknowledged(steps=steps, lacking=lacking):
                     self.complete, self._lacking = steps, lacking
-                    recorder_speaks = True
+                    silent = False
                 case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who)
         if time.monotonic() - self._reported >= REPORT_SECONDS:
@@ -162,8 +166,8 @@ class Conductor:
     def _takes_part(self, who: str) -> bool:
         return who in self._everybody or who in map(sensor_who, self._plan.external)
 
-    def _what_is_late(self, recorder_speaks: bool) -> str:
-        if not recorder_speaks:
-            return f"the recorder has acknowledged nothing for {self._plan.deadline:g} s, at step {self.complete}"
+    def _what_is_late(self, silent: bool) -> str:
+        if silent:
+            return f"the recorder has acknowledged nothing for {2.0 * self._plan.deadline:g} s, at step {self.complete}"
         topics = ", ".join(self._lacking)
         return f"step {self.complete} lacks {topics} after {self._plan.deadline:g} s"

@@ -386,9 +386,9 @@ def test_one_run_is_no_ensemble() -> None:
 
 
 # the disturbance kind "worst-case": in a gains file, a live run, a replay
-def worst_gains(*, amplitude: float = 2.0) -> Gains:
+def worst_gains(*, amplitude: float = 2.0, **sizes: Any) -> Gains:
     """Gains of a problem that asks for its worst case, with it."""
-    problem = real_problem(2)
+    problem = real_problem(2, **sizes)
     document = {**problem.document(), "disturbance": {"kind": "worst-case", "amplitude": amplitude}}
     return with_worst_case(observer_gains(Problem.from_document(document)))
 
@@ -417,7 +417,7 @@ def test_a_design_stores_the_worst_case(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_the_worst_case_drives_a_live_run_and_replay_checks_it(tmp_path: Path) -> None:
     """As processes; and the run is that of the ensemble."""
-    gains, recording = worst_gains(), tmp_path / "run.mcap"
+    gains, recording = worst_gains(ny=(1, 2)), tmp_path / "run.mcap"
     gains.save(tmp_path / "gains.json")
     ran = runs.peakmesh("run", tmp_path / "gains.json", "--steps", 40, "--seed", 5, "-o", recording)
     assert ran.returncode == 0, ran.stderr
@@ -442,14 +442,15 @@ def test_replay_finds_another_disturbance_than_the_worst(tmp_path: Path) -> None
 
 
 def test_gains_that_lack_the_worst_case_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    claiming(worst_gains(), 100.0).model_copy(update={"worst_case": None}).save(tmp_path / "gains.json")
+    claiming(worst_gains(ny=(1, 2)), 100.0).model_copy(update={"worst_case": None}).save(tmp_path / "gains.json")
     sentence = 'the problem asks for disturbance kind "worst-case", but the gains have no worst_case; design them again'
     ran = runs.peakmesh("run", tmp_path / "gains.json", "--steps", 40, "-o", tmp_path / "run.mcap")
     assert (ran.returncode, ran.stderr.strip()) == (2, f"peakmesh: {sentence}")
     assert not (tmp_path / "run.mcap").exists()
     assert main(["simulate", str(tmp_path / "gains.json")]) == 2
     assert capsys.readouterr().err == f"peakmesh: {sentence}\n"
-    assert main(["simulate", str(tmp_path / "gains.json"), "--disturbance", "worst-case", "--runs", "50"]) == 0
+    few = ["--runs", "50", "--processes", "1"]
+    assert main(["simulate", str(tmp_path / "gains.json"), "--disturbance", "worst-case", *few]) == 0
 
 
 def test_a_worst_case_for_another_number_of_disturbances_is_refused(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_a_worker_that_dies_is_said() -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_no_worker_outlives_whoever_started_it(how: signal.Signals, tmp_path: Path) -> None:
+def test_no_worker_outlives_whoever_started_it(ctrl_c: None, how: signal.Signals, tmp_path: Path) -> None:
     """Ctrl-C ends jobs that run, and so does the end of the process that waits for them."""
     script = tmp_path / "starter.py"
     script.write_text(

@@ -9,16 +9,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from agent.contract.gains import Gains
 from agent.contract.keys import model_of
 from agent.contract.messages import Message
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
+from agent.launch import launch
+from agent.plan import Plan
 
-PATIENCE = 60.0  # seconds after which a wait of a test has failed
+MANY = 100_000  # steps of a run that a test ends itself
+PATIENCE = 300.0  # seconds after which a wait of a test has failed, on a busy machine too
 
 
 def program(*arguments: object) -> list[str]:
@@ -127,3 +131,44 @@ def freeze(pid: int) -> None:
 
 def thaw(pid: int) -> None:
     os.kill(pid, signal.SIGCONT)
+
+
+def run_here(
+    gains_path: Path,
+    recording: Path,
+    *,
+    at: int = 0,
+    do: Callable[[], None] = lambda: None,
+    heed: Callable[[dict[str, Any]], None] = lambda word: None,
+    **plan: Any,
+) -> dict[str, Any]:
+    """Launch a run from this process, call `do` once `at` steps are complete; `heed` gets every word."""
+    done = False
+
+    def report(word: dict[str, Any]) -> None:
+        nonlocal done
+        heed(word)
+        if word.get("complete", 0) > at and not done:
+            done = True
+            do()
+
+    return launch(
+        gains_path,
+        Gains.load(gains_path),
+        Plan(**{"steps": MANY, "seed": 1, "deadline": PATIENCE, **plan}),
+        run="test",
+        recording=recording,
+        force=False,
+        wait=PATIENCE,
+        report=report,
+    )
+
+
+def roles_left() -> dict[int, list[str]]:
+    """The children of this process that play a role of a run."""
+    return {pid: command for pid, command in children(os.getpid()).items() if "agent" in command}
+
+
+def kill(*words: str) -> Callable[[], None]:
+    """Kill -9 the child of this process whose command line has these words."""
+    return lambda: os.kill(child(os.getpid(), *words), signal.SIGKILL)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
+from runs import PATIENCE
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
 from agent.contract.messages import Acknowledged, Control, Mode
-from agent.network.bus import Bus
+from agent.network import bus
+from agent.network.bus import REPLAY_SECONDS, Bus
 from agent.network.configuration import Network
-from agent.network.words import Peer, RunClosed, Sample
-
-PATIENCE = 20.0
+from agent.network.words import Incoming, Peer, Replayed, RunClosed, Sample
 
 
 @pytest.fixture
@@ -123,7 +124,33 @@ def test_a_peer_that_leaves_is_seen(coordinator: Bus) -> None:
         assert word is not None
 
 
-def test_signals_are_heeded_until_we_leave(coordinator: Bus, recorder: Bus) -> None:
+@pytest.mark.parametrize("gap", [0.9 * REPLAY_SECONDS, 1.1 * REPLAY_SECONDS])
+def test_whoever_asks_for_a_replay_gives_up_in_silence_alone(
+    gap: float, coordinator: Bus, recorder: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long everything takes on a busy machine: where something comes, more may come."""
+    now, samples = 0.0, [Sample(MODE, b"%d" % k, None) for k in range(10)]
+    words: list[Incoming] = [*samples, Replayed(COORDINATOR)]
+
+    def take(deadline: float) -> Incoming | None:
+        nonlocal now
+        if now + gap > deadline:
+            now = deadline
+            return None
+        now += gap
+        recorder._words.taken += 1
+        return words.pop(0)
+
+    monkeypatch.setattr(bus, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(recorder._words, "take", take)
+    found = list(recorder.replayed([COORDINATOR]))
+    if gap < REPLAY_SECONDS:
+        assert (found, now) == (samples, pytest.approx(11 * gap))
+    else:
+        assert (found, now) == ([], REPLAY_SECONDS)
+
+
+def test_signals_are_heeded_until_we_leave(ctrl_c: None, coordinator: Bus, recorder: Bus) -> None:
     """A signal interrupts whoever is running, and does not cut the closing short."""
     signal.raise_signal(signal.SIGTERM)
     with pytest.raises(Interrupted) as caught:
@@ -136,12 +163,16 @@ def test_signals_are_heeded_until_we_leave(coordinator: Bus, recorder: Bus) -> N
     assert last_word.closed
 
 
-def test_handlers_are_given_back() -> None:
-    """Whoever had the signals before has them again afterwards."""
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("ignored", [False, True])
+def test_handlers_are_given_back(ctrl_c: None, ignored: bool) -> None:
+    """Whoever had the signals before has them again afterwards; a SIGINT that is ignored stays so all the time."""
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     with Bus(Network(), run="test", who=COORDINATOR):
-        assert signal.getsignal(signal.SIGINT) != before
-    assert signal.getsignal(signal.SIGINT) == before
+        heeded = {number for number, handler in before.items() if signal.getsignal(number) != handler}
+    assert heeded == ({signal.SIGTERM} if ignored else {signal.SIGINT, signal.SIGTERM})
+    assert {number: signal.getsignal(number) for number in before} == before
 
 
 def test_who_is_missing_is_named(coordinator: Bus) -> None:
@@ -149,6 +180,10 @@ def test_who_is_missing_is_named(coordinator: Bus) -> None:
     impatient = Network(connect=(coordinator.locators()[0],), wait=0.3)
     with Bus(impatient, run="test", who=PLANT) as plant:
         plant.enter()
+        there = Peer(COORDINATOR, present=True)
+        while plant._words.take(time.monotonic() + PATIENCE) != there:
+            pass
+        plant._words.set_aside(there)  # it has come, however long that took
         started = time.monotonic()
         with pytest.raises(RunBroken, match=r'^node "1" and the recorder did not join the run within 0\.3 s$'):
             list(plant.meet([COORDINATOR, RECORDER, "node-1"]))

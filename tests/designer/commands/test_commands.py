@@ -283,7 +283,6 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 # The whole job, and what is kept of an old one.
-@pytest.mark.timeout(180)
 def test_demo(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One command designs, runs, replays and reports the paper's second example; every file it names is there."""
     assert run("demo", "--steps", "50", "--json", "--method", "decomposed") == 0

@@ -1,0 +1,74 @@
+"""What the coordinator says of a run that makes no progress."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from made_recordings import random_gains, random_problem
+
+from agent.contract.errors import RunBroken
+from agent.contract.messages import Acknowledged
+from agent.network.words import Incoming
+from agent.plan import Plan
+from agent.roles import coordinator
+from agent.roles.coordinator import Conductor
+
+DEADLINE = 10.0
+
+
+class Scripted:
+    """A bus of which every word comes so many seconds after the last one; then there is silence."""
+
+    who = "coordinator"
+
+    def __init__(self, *words: tuple[float, Incoming]) -> None:
+        self.now = 1000.0
+        self._words = list(words)
+
+    def receive(self, *, timeout: float) -> Incoming | None:
+        if self._words and self._words[0][0] <= timeout:
+            seconds, word = self._words.pop(0)
+            self.now += seconds
+            return word
+        self.now += timeout
+        return None
+
+    def publish(self, topic: str, message: object) -> None:
+        """Nobody listens."""
+
+
+def acknowledged(steps: int, *lacking: str) -> Acknowledged:
+    return Acknowledged(
+        steps=steps, messages=0, missing=0, received={}, reached={}, lacking=list(lacking), closed=False
+    )
+
+
+def give_out_modes(bus: Scripted, monkeypatch: pytest.MonkeyPatch, *, steps: int = 2) -> None:
+    monkeypatch.setattr(coordinator, "time", SimpleNamespace(monotonic=lambda: bus.now))
+    plan = Plan(steps=steps, seed=0, window=1, deadline=DEADLINE)
+    Conductor(bus, random_gains(random_problem(1)), plan, lambda word: None).give_out_modes()  # type: ignore[arg-type]
+
+
+def test_whoever_lacks_is_named_though_the_recorder_says_so_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the recorder's word may come after the deadline; the blame is not the recorder's."""
+    bus = Scripted((1.5 * DEADLINE, acknowledged(0, "node/n1/estimate")))
+    with pytest.raises(RunBroken, match=r"^step 0 lacks node/n1/estimate after 10 s$"):
+        give_out_modes(bus, monkeypatch)
+
+
+def test_a_recorder_that_complains_in_time_ends_the_run_at_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = Scripted((1.0, acknowledged(1)), (1.0, acknowledged(1, "plant/state")))
+    with pytest.raises(RunBroken, match=r"^step 1 lacks plant/state after 10 s$"):
+        give_out_modes(bus, monkeypatch)
+    assert bus.now == 1000.0 + 1.0 + DEADLINE
+
+
+def test_a_recorder_that_says_nothing_at_all_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RunBroken, match=r"^the recorder has acknowledged nothing for 20 s, at step 0$"):
+        give_out_modes(Scripted(), monkeypatch)
+
+
+def test_progress_after_the_deadline_is_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody has said what is late, the run goes on."""
+    give_out_modes(Scripted((1.5 * DEADLINE, acknowledged(1)), (1.0, acknowledged(2))), monkeypatch)

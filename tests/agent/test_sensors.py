@@ -1,0 +1,63 @@
+"""Sensors of one's own: the script in docs/, and what it may say."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from made_recordings import observer_gains, real_problem
+from places import ROOT
+from runs import PATIENCE, logged, run_here
+
+from agent.contract.gains import Gains
+from designer.replay import replay
+
+SENSOR = ROOT / "docs" / "sensor.py"
+
+
+def measured_by(
+    script: Path, gains_path: Path, recording: Path, *, node: str, steps: int
+) -> list[tuple[int, list[float]]]:
+    """Run with a sensor script for one node; step and y of its measurements. Nothing is missing, the replay agrees."""
+    sensor: list[subprocess.Popen[bytes]] = []
+
+    def start_sensor(word: dict[str, Any]) -> None:
+        if "listening" in word:
+            sensor.append(subprocess.Popen([sys.executable, script, "test", node, word["listening"][0]]))
+
+    try:
+        summary = run_here(gains_path, recording, heed=start_sensor, steps=steps, external=(node,))
+        assert sensor[0].wait(PATIENCE) == 0  # it ends with the run
+    finally:
+        for process in sensor:
+            process.kill()
+            process.wait()
+    assert summary["missing"] == 0
+    assert replay(recording).exit_code == 0
+    documents = [json.loads(m.payload) for m in logged(recording) if m.topic == f"node/{node}/measurement"]
+    return [(document["step"], document["y"]) for document in documents]
+
+
+def test_sensor_of_ones_own(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
+    """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
+    lines = [line for line in SENSOR.read_text().splitlines() if line.strip()]
+    assert len(lines) < 20
+    assert not any("peakmesh import" in line or "import agent" in line for line in lines)
+    name = pair.problem.node_names[0]
+    measured = measured_by(SENSOR, pair_path, tmp_path / "run.mcap", node=name, steps=60)
+    assert measured == [(k, [0.0]) for k in range(60)]
+
+
+def test_sensor_that_has_nothing_to_say(tmp_path: Path) -> None:
+    """At every third step it publishes [], which a node that sees its losses takes for what it is."""
+    problem, script, reading = real_problem(5, radius=1.02, ny=(1, 1)), tmp_path / "sensor.py", '"y": [0.0]'
+    assert problem.nodes[1].seen
+    observer_gains(problem).save(tmp_path / "gains.json")
+    text = SENSOR.read_text()
+    assert text.count(reading) == 1
+    script.write_text(text.replace(reading, '"y": [0.5] if json.loads(mode)["step"] % 3 else []'))
+    measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n1", steps=30)
+    assert measured == [(k, [0.5] if k % 3 else []) for k in range(30)]

@@ -1,0 +1,104 @@
+"""The barrier and the entries it takes: gradients, domain, and the curvature that BFGS begins with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from networks import random_gains, random_problem, real_networks
+
+from agent.contract.arrays import Array
+from agent.contract.problem import Problem
+from designer.gain.exact import exact_gain
+from designer.model.error_model import error_model
+from designer.search.barrier import Barrier, Entries
+from designer.search.starts import consensus_gains, least_variance_gains
+
+PROBLEMS = [random_problem(1), random_problem(2), *real_networks(3).values()]
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
+def test_the_gradients_of_both_barriers_agree_with_differences(problem: Problem) -> None:
+    """By every direction of the gains that they may take, and of y = log g."""
+    barrier = Barrier(problem, 9)
+    gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
+    v = barrier.entries.pack(*gains)
+    y = math.log(2.0 * exact_gain(error_model(problem, *barrier.entries.unpack(v))).high ** 2)
+    rng = np.random.default_rng(0)
+    for function, x in ((barrier.descent(0.03), np.append(v, y)), (barrier.centre(y, 2.0), v)):
+        _, gradient = function(x)
+        for _ in range(3):
+            direction = 1e-5 * rng.normal(size=len(x))
+            difference = function(x + direction)[0] - function(x - direction)[0]
+            assert difference / 2.0 == pytest.approx(float(gradient @ direction), rel=1e-5, abs=1e-10)
+
+
+def test_the_barrier_is_finite_exactly_where_g_is_above_gamma_squared() -> None:
+    """Just above gamma_T^2 it is a number, just below it is infinite."""
+    problem = random_problem(3)
+    barrier = Barrier(problem, 200)
+    v = barrier.entries.pack(*random_gains(problem, 3, size=0.1))
+    gain = exact_gain(error_model(problem, *barrier.entries.unpack(v)))
+    J = barrier.descent(0.1)
+    assert math.isfinite(J(np.append(v, 2.0 * math.log(gain.high * (1.0 + 1e-6))))[0])
+    assert J(np.append(v, 2.0 * math.log(gain.low * (1.0 - 1e-6))))[0] == math.inf
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
+def test_bfgs_begins_with_the_curvature_of_what_each_node_chooses(problem: Problem) -> None:
+    """With Y_bar and the moments held, -log det is a quadratic of one node's gains; second differences of it are exact.
+
+    It is written out with S(Y_bar), which shares nothing with the regressions of `inverse_hessian`.
+    """
+    barrier, mu, rng = Barrier(problem, 9), 0.03, np.random.default_rng(0)
+    gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
+    v = barrier.entries.pack(*gains)
+    x = np.append(v, math.log(2.0 * exact_gain(error_model(problem, *gains)).high ** 2))
+    found = barrier._swept(x)
+    assert found is not None
+    swept, slopes = found
+
+    def held(v: Array) -> float:
+        operator = barrier.operator(v)
+        pairs = zip(swept.Y_bar, slopes.moments, strict=True)
+        return mu * sum(float((operator.joint(Y_bar) * moments).sum()) for Y_bar, moments in pairs)
+
+    inverse = barrier.inverse_hessian(x, mu, ridge=0.7)
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            at = barrier.entries.of_node(s, i)
+            damped = np.linalg.inv(inverse[np.ix_(at, at)])
+            hessian = damped - np.diag(damped.diagonal() * 0.1 / 1.1)
+            direction = np.zeros(len(v))
+            direction[at] = rng.normal(size=len(at))
+            second = held(v + direction) - 2.0 * held(v) + held(v - direction) + 0.7 * float(direction @ direction)
+            assert float(direction[at] @ hessian @ direction[at]) == pytest.approx(second, rel=1e-6)
+
+
+def test_entries_are_those_that_the_topologies_allow() -> None:
+    """Consensus gains keep to them, and packing loses nothing of them."""
+    problem = random_problem(4)
+    entries = Entries(problem)
+    K_bar, H_bar = consensus_gains(problem, weight=0.3)
+    v = entries.pack(K_bar, H_bar)
+    assert np.count_nonzero(v) == np.count_nonzero(K_bar) + np.count_nonzero(H_bar)
+    for stacked, back in zip((K_bar, H_bar), entries.unpack(v), strict=True):
+        np.testing.assert_allclose(stacked, back, rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", sorted(real_networks(4)))
+def test_the_entries_of_a_node_are_its_rows_and_all_are_somebodys(kind: str) -> None:
+    problem = real_networks(4)[kind]
+    entries, nx, seen = Entries(problem), problem.nx, []
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            at = entries.of_node(s, i)
+            seen += at.tolist()
+            v = np.zeros(len(entries.units))
+            v[at] = 1.0
+            for moved, still in zip(entries.unpack(v), entries.unpack(0.0 * v), strict=True):
+                where, rows, _ = np.nonzero(moved != still)
+                assert set(where) <= {s}  # no K at all where a node hears itself alone
+                assert set(rows // nx) <= {i}
+    assert sorted(seen) == list(range(len(entries.units)))

@@ -1,0 +1,79 @@
+"""From a problem to a file with a certificate of kind "exact", or to a sentence that says why there is none."""
+
+from __future__ import annotations
+
+import pytest
+
+from agent.contract.errors import Unattainable
+from agent.contract.gains import Gains
+from agent.contract.problem import Problem
+from designer.gain.exact import exact_gain
+from designer.gain.floor import floor
+from designer.model.error_model import error_model
+from designer.problems import find
+from designer.proof.certificate import verify
+from designer.search import descent
+from designer.search.exact_design import design_exact
+from designer.search.starts import least_variance_gains
+from designer.synthesis import design
+
+
+def alone(beta: float) -> Problem:
+    """One node before x+ = 2 x + w; no gains are mean-square stable unless beta > 1 - 1 / 2^2 = 0.75."""
+    node = {"name": "only", "C": [[1.0]], "D": [[0.0, 0.1]], "arrival_probability": beta, "loss": "seen"}
+    return Problem.from_document(
+        {
+            "name": "alone",
+            "plant": {"A": [[2.0]], "B": [[1.0, 0.0]], "M": [[1.0]]},
+            "node": [node],
+            "topology": [{"name": "always", "adjacency": [[1.0]]}],
+            "markov": {"transition": [[1.0]], "initial": "always"},
+            "unbiased": True,
+        }
+    )
+
+
+def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_is_no_design(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
+    for name, value in {"_FINE": (3e-4,), "_HORIZON": 10, "_LONGEST": 20}.items():
+        monkeypatch.setattr(descent, name, value)
+    assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
+    with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
+        design_exact(alone(0.7), starts={"least variance": least_variance_gains(alone(0.7))})
+
+
+def test_a_plant_that_nobody_sees_grow_is_refused_in_one_sentence() -> None:
+    document = alone(1.0).document()
+    document["node"][0]["C"] = [[0.0]]
+    with pytest.raises(Unattainable, match="all sensors together do not show an unstable part"):
+        design_exact(Problem.from_document(document))
+
+
+def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
+    """floor <= exact <= gamma, and the check confirms gamma for what a reader of the file has."""
+    problem = find("two-nodes")
+    gains = Gains.from_bytes(design(problem, method="exact").canonical(), source="memory")
+    proved = gains.certificate
+    assert (proved.kind, proved.form, gains.method) == ("exact", "full", "exact")
+    assert proved.holds
+    assert proved.exact is not None
+    assert proved.floor is not None
+    assert proved.P is not None
+    assert proved.horizon is not None
+    assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
+    assert verify(gains).holds
+    lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
+    verdict = verify(gains.model_copy(update={"certificate": lower}))
+    assert not verdict.holds
+    assert verdict.failure is not None
+
+
+def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
+    """floor <= exact gain of its gains <= its gamma."""
+    problem = find("two-nodes")
+    proved = design(problem, method="theorem2-reduced").certificate
+    assert proved.exact is not None
+    assert proved.floor == floor(problem)
+    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6)
