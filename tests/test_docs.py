@@ -72,6 +72,13 @@ def unknown(command: str, rest: str) -> list[str]:
     )
 
 
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_pictures_exist(document: str) -> None:
+    """`docs/name.svg`, shown or named."""
+    named = re.findall(r"\bdocs/\w+\.svg\b", DOCUMENTS[document])
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
 @pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md", "recordings/README.md"])
 def test_commands_exist(document: str) -> None:
     """Every `peakmesh COMMAND --option` and every `.ci/script`."""
