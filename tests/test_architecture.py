@@ -63,6 +63,7 @@ DOORS = {
     "zenoh": ["agent/network/session.py"],
     "mcap": ["agent/contract/recording/"],
     "zstandard": ["agent/contract/recording/"],
+    "lz4": ["agent/contract/recording/"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
     "scipy": ["designer/lmi/", "designer/gain/exact.py"],
