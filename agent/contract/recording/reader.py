@@ -41,9 +41,10 @@ class RecordingReader:
         self.path, self.paths = path, (path, *more)
         self.foreign: Counter[str] = Counter()  # messages of topics that are not of a run
         self.others = 0  # messages of the other runs in it
+        self.is_unchecked = False  # no checksum covers some messages
         self._lost: list[str] = []  # what turned out to be damaged while messages were read
         self._sources: list[Source] = []
-        label = " and ".join(map(str, self.paths)) if len(self.paths) < 3 else f"{path} and {len(more)} more"
+        self.label = label = " and ".join(map(str, self.paths)) if len(more) < 2 else f"{path} and {len(more)} more"
         try:
             for one in self.paths:
                 self._sources.append(Source(one))
@@ -52,7 +53,7 @@ class RecordingReader:
             self._chosen = contents.chosen(runs, run, label=label)
             self.window = contents.window(self._chosen, runs, label=label)
             self._gains: Gains | None = None
-            self._given, self._label = gains, label
+            self._given = gains
             if needs_gains or gains is not None:
                 _ = self.gains
         except BaseException:
@@ -65,7 +66,7 @@ class RecordingReader:
     def gains(self) -> Gains:
         """Raises InputError where they were left out of the file."""
         if self._gains is None:
-            self._gains = contents.find_gains(self._chosen, self._surveys, self._given, label=self._label)
+            self._gains = contents.find_gains(self._chosen, self._surveys, self._given, label=self.label)
         return self._gains
 
     @property
@@ -95,9 +96,8 @@ class RecordingReader:
     def notes(self) -> list[str]:
         """What is odd, and harms nothing."""
         found = [self._of(one, sentence) for one in self._surveys for sentence in one.notes]
-        unchecked = [one for one in self._surveys if one.has_loose and not one.is_covered]
-        if unchecked:
-            found.append("no checksum covers the messages: they stand outside chunks")
+        if self.is_unchecked:
+            found.append("no checksum covers the messages: what was changed later cannot be told from what was sent")
         return found
 
     @property
@@ -176,6 +176,7 @@ class _Pass:
         """Every message of the sound stretches, in the order of the file."""
         for frame in self._survey.frames():
             if frame.opcode == records.MESSAGE and self._survey.has_loose:
+                self._reader.is_unchecked |= not self._survey.is_covered
                 yield records.message_of(self._survey.body(frame))
             elif frame.opcode == records.CHUNK:
                 yield from self._chunk(self._survey.body(frame))
@@ -190,7 +191,9 @@ class _Pass:
     def _chunk(self, body: bytes) -> Iterator[RawMessage]:
         self._chunks += 1
         try:
-            for record in records.records_in(records.unpacked(records.chunk_of(body))):
+            chunk = records.chunk_of(body)
+            self._reader.is_unchecked |= not chunk.crc and not self._survey.is_covered
+            for record in records.records_in(records.unpacked(chunk)):
                 if isinstance(record, RawMessage):
                     yield record
                 elif isinstance(record, Channel):
