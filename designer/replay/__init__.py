@@ -18,13 +18,12 @@ whole network. It never imports the runtime's filter.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path as FilePath
 
 import numpy as np
 
 from agent.contract.problem import Problem
-from agent.contract.recording.reader import Progress
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
 from designer.replay.gamma import checked_gamma
@@ -35,6 +34,7 @@ from designer.replay.proofs import Check
 from designer.replay.trace import Trace
 from designer.replay.verdict import Divergence, Peak, Proof, Verdict, kind_of
 
+Report = Callable[[str, int, int], None]  # what is being done, how much of it, and of how much
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
 _STEPS_AT_ONCE = 1024
 _NUMBERS_AT_ONCE = 2_000_000  # of output covariances held at once, 16 MB
@@ -79,21 +79,24 @@ def replay(
     run: str | None = None,
     gains: FilePath | None = None,
     part: Part | None = None,
-    report: Progress | None = None,
+    report: Report | None = None,
 ) -> Verdict:
     """Read a recording, or the files that hold parts of one, and judge it. Raises InputError for what is none.
 
-    `run` and `gains` as in `load`; `part` is what alone is judged.
+    `run` and `gains` as in `load`; `part` is what alone is judged. `report` is told what is being done, how far that
+    is, and of how much.
     """
-    return judge(load(path, run=run, gains=gains, part=part, report=report), part=part)
+    tell = report or (lambda what, done, of: None)
+    log = load(path, run=run, gains=gains, part=part, report=lambda done, of: tell("reading", done, of))
+    return judge(log, part=part, report=report)
 
 
-def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None) -> Verdict:
+def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, report: Report | None = None) -> Verdict:
     """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
     central = Central.of(log.gains)
     tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names, trace, part)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
-        audit = _compare(log, central, tally)
+        audit = _compare(log, central, tally, report or (lambda what, done, of: None))
     return _verdict(log, tally, audit)
 
 
@@ -193,7 +196,7 @@ class PathAudit:
         return smallest if self.step >= 0 else "nothing disturbed the run"
 
 
-def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float] | None:
+def _compare(log: Log, central: Central, tally: Tally, report: Report) -> tuple[PathAudit, float] | None:
     """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
     drawn = draw(log, central)
     inputs, eta = logged_inputs(log, central, drawn), logged_states(log, central)
@@ -204,6 +207,7 @@ def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float
         tally.add(proofs.input_checks(log, central, drawn, now))
         tally.add(proofs.step_checks(log, central, inputs, eta, now))
         tally.add(proofs.message_checks(log, central, hears, now))
+        report("comparing, first pass", now.stop, log.steps)
     whole = free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
@@ -213,6 +217,7 @@ def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float
     audit, errors = PathAudit(log.gains.problem.nw, tally.part), log.error_norms()
     for part in free_run.free_run(log, central, whole, block=block):
         tally.add([free_run.free_check(log, central, part)])
+        report("comparing, second pass", part.first + len(part.eta), log.steps)
         if log.has_plant:
             path = free_run.path_block(central, part, errors, energy_before)
             audit.add(path, tally.tolerance)

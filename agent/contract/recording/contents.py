@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
+from functools import reduce
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from agent.contract.recording.survey import Survey
 
 IDENTITY = ("run", "gains", "problem_digest", "seed", "steps", "started")  # metadata that make two records one run
 OURS = {"run", "end"}  # metadata
+CONTINUES = "continues"  # the status at the end of a part that another one follows
 ATTACHED = {"gains.json", "problem.json", "layout.json"}
 _LARGEST = 1 << 28  # bytes of an attachment that is looked into
 
@@ -33,6 +35,10 @@ class Run(NamedTuple):
 
     facts: Facts
     end: Facts | None
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        return _identity(self.facts)
 
     @property
     def name(self) -> str:
@@ -54,20 +60,36 @@ def runs_in(surveys: Sequence[Survey]) -> list[Run]:
         begun = [facts for name, facts in survey.metadata if name == "run" and facts.get("format") == FORMAT]
         ended = [facts for name, facts in survey.metadata if name == "end" and "status" in facts]
         for facts, end in zip(begun, _ends(begun, ended), strict=True):
-            key = tuple(facts.get(word, "") for word in IDENTITY)
-            before = found.get(key)
-            found[key] = Run(before.facts if before else facts, end or (before.end if before else None))
+            key = _identity(facts)
+            before = found.get(key, Run(facts, None))
+            found[key] = Run(before.facts, _later(before.end, end))
     if not found:
         raise InputError(_no_run(surveys))
     return list(found.values())
+
+
+def _identity(facts: Facts) -> tuple[str, ...]:
+    return tuple(facts.get(word, "") for word in IDENTITY)
+
+
+def _later(one: Facts | None, other: Facts | None) -> Facts | None:
+    """The last word of a run of two: a part that is not the last says that the run continues."""
+    if one is None or other is None:
+        return one or other
+    return max(one, other, key=lambda end: (end["status"] != CONTINUES, _steps(end)))
+
+
+def _steps(end: Facts) -> int:
+    text = end.get("steps", "")
+    return int(text) if text.isascii() and text.isdigit() else -1
 
 
 def _ends(begun: list[Facts], ended: list[Facts]) -> list[Facts | None]:
     """The `end` of each `run` of a file: by its place among them, or the last one where the runs are all the same."""
     if len(begun) == len(ended):
         return list(ended)
-    if len({tuple(facts.get(word, "") for word in IDENTITY) for facts in begun}) == 1:
-        return [ended[-1] if ended else None] * len(begun)
+    if len({_identity(facts) for facts in begun}) == 1:
+        return [reduce(_later, ended, None)] * len(begun)
     return [None] * len(begun)
 
 
@@ -162,30 +184,24 @@ def _no_gains(failures: list[str], wanted: str, surveys: Sequence[Survey], label
     return f"{label} has no gains: its attachment gains.json is missing, a filter may have left it out; {hint}"
 
 
-def problem_fault(run: Run, surveys: Sequence[Survey]) -> str:
-    """What is wrong with the attached problem.json, "" where nothing is, or there is none."""
-    wanted, fault = run.facts.get("problem_digest", ""), ""
-    for survey, attached in _named("problem.json", surveys) if wanted else ():
-        try:
-            data = _data(survey, attached)
-        except InputError as error:
-            fault = str(error)
-            continue
-        found = _problem_digest(data)
-        if found == wanted:
-            return ""
-        fault = (
-            f"the attachment problem.json was altered or exchanged: its digest is {found[:12]}..., "
-            f"the run's is {wanted[:12]}..."
-        )
-    return fault
+def altered(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
+    """Of the attachments whose digests the run names, those of which there is none that fits, a sentence each."""
+    for name, key, model in (("problem.json", "problem_digest", Problem), ("gains.json", "gains", Gains)):
+        found = [_digest(survey, attached, model) for survey, attached in _named(name, surveys)]
+        wanted = run.facts.get(key)
+        if wanted and found and wanted not in found:
+            yield (
+                f"the attachment {name} was altered or exchanged: its digest is {found[-1][:12]}..., "
+                f"the run's is {wanted[:12]}..."
+            )
 
 
-def _problem_digest(data: bytes) -> str:
-    """Of the problem in it, whatever its spaces; of its bytes where it is none."""
+def _digest(survey: Survey, attached: Attached, model: type[Problem] | type[Gains]) -> str:
+    """Of what is in an attachment, whatever its spaces; of its bytes where that is something else."""
+    data = survey.source.read(attached.start, min(attached.size, _LARGEST))
     try:
-        return Problem.from_document(json.loads(data)).digest()
-    except (InputError, ValueError, RecursionError):
+        return model.model_validate(json.loads(data)).digest()
+    except (ValueError, RecursionError):
         return hashlib.sha256(data).hexdigest()
 
 

@@ -14,6 +14,7 @@ from typing import Self
 from agent.contract.errors import counted
 from agent.contract.gains import Gains
 from agent.contract.recording import Logged, contents, records
+from agent.contract.recording.contents import Run
 from agent.contract.recording.naming import Naming
 from agent.contract.recording.records import Broken, Channel, RawMessage
 from agent.contract.recording.source import Source
@@ -36,17 +37,25 @@ class RecordingReader:
     """
 
     def __init__(
-        self, path: Path, *more: Path, run: str | None = None, gains: Path | None = None, needs_gains: bool = True
+        self,
+        path: Path | Source,
+        *more: Path,
+        run: str | None = None,
+        gains: Path | None = None,
+        needs_gains: bool = True,
     ) -> None:
-        self.path, self.paths = path, (path, *more)
+        """A Source that is given is closed with the reader. Raises InputError for what is no recording."""
+        self._sources = [path] if isinstance(path, Source) else []
+        self.path = path.path if isinstance(path, Source) else path
+        self.paths = (self.path, *more)
         self.foreign: Counter[str] = Counter()  # messages of topics that are not of a run
         self.others = 0  # messages of the other runs in it
         self.is_unchecked = False  # no checksum covers some messages
         self._lost: list[str] = []  # what turned out to be damaged while messages were read
-        self._sources: list[Source] = []
-        self.label = label = " and ".join(map(str, self.paths)) if len(more) < 2 else f"{path} and {len(more)} more"
+        several = f"{self.path} and {len(more)} more"
+        self.label = label = " and ".join(map(str, self.paths)) if len(more) < 2 else several
         try:
-            for one in self.paths:
+            for one in self.paths[len(self._sources) :]:
                 self._sources.append(Source(one))
             self._surveys = [survey(source) for source in self._sources]
             runs = contents.runs_in(self._surveys)
@@ -72,11 +81,11 @@ class RecordingReader:
     @property
     def damages(self) -> list[str]:
         """What is wrong with the files, a sentence each; each begins with the file's name where there are several."""
-        found = [f"before it was recovered {word}" for word in (self.run.get("recovered.damage"),) if word]
+        found = [f"before it was recovered: {word}" for word in (self.run.get("recovered.damage"),) if word]
         for one in self._surveys:
             found += [self._of(one, sentence) for sentence in one.damage]
         found += self._lost
-        if self.is_doubtful:
+        if self.is_doubtful and "recovered.checksum" not in self.run:
             found.append("it was changed after it was written: it does not fit its checksum")
         return found
 
@@ -90,6 +99,8 @@ class RecordingReader:
     @property
     def is_doubtful(self) -> bool:
         """A checksum over everything fails, and nothing that was found explains it: any number may be a wrong one."""
+        if self.run.get("recovered.checksum") == "failed":
+            return True
         return any(one.is_contradicted and not one.damage for one in self._surveys) and not self._lost
 
     @property
@@ -110,8 +121,8 @@ class RecordingReader:
     @property
     def faults(self) -> list[str]:
         """What was altered beside the messages."""
-        fault = contents.problem_fault(self._chosen, self._surveys)
-        return [fault] if fault else []
+        told = self.run.get("recovered.faults")
+        return [*contents.altered(self._chosen, self._surveys), *([told] if told else [])]
 
     def attachment(self, name: str) -> bytes | None:
         """The bytes of the first sound attachment of this name, None where there is none."""
@@ -123,6 +134,7 @@ class RecordingReader:
         done = 0
         self._lost.clear()
         self.foreign.clear()
+        self.is_unchecked = self.run.get("recovered.checksum") == "none"
         self.others = 0
         for one in self._surveys:
             yield from _Pass(self, one, done, report).messages()
@@ -146,6 +158,15 @@ class RecordingReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def runs_of(path: Path) -> list[Run]:
+    """The runs that a file holds, by a look at its metadata. Raises InputError where it holds none."""
+    source = Source(path)
+    try:
+        return contents.runs_in([survey(source)])
+    finally:
+        source.close()
 
 
 class _Pass:

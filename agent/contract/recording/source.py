@@ -42,7 +42,8 @@ class Source:
     a recorder appends meanwhile is not seen.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, kind: str = "recording") -> None:
+        """`kind` names what was expected there, for errors. Raises InputError where nothing can be read."""
         self.path = path
         self.notes: list[str] = []
         self.damage: list[str] = []
@@ -50,9 +51,9 @@ class Source:
         try:
             self._file = path.open("rb")
         except FileNotFoundError:
-            raise InputError(f"{path} does not exist; a recording was expected there") from None
+            raise InputError(f"{path} does not exist; a {kind} was expected there") from None
         except OSError as error:
-            raise InputError(f"{path} could not be read as a recording: {error.strerror}") from error
+            raise InputError(f"{path} could not be read as a {kind}: {error.strerror}") from error
         try:
             if not self._file.seekable():
                 self._spool(self._file)
