@@ -49,7 +49,7 @@ def replay_command(options: argparse.Namespace) -> int:
     from designer.replay.several import replay_all, together
 
     groups = together(options.recordings, run=options.run)
-    with_options = {"run": options.run, "gains": options.gains, "part": _part(options), "report": progress()}
+    with_options = {"run": options.run, "gains": options.gains, "part": _part(options), "report": Progress()}
     if len(groups) > 1:
         table = replay_all(groups, **with_options)
         print(json.dumps(table.document()) if options.json else table.text())
@@ -78,7 +78,7 @@ def _step(text: str) -> int:
     return int(text)
 
 
-class progress:
+class Progress:
     """Says on stderr how far something is, every few seconds."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, counted
-from designer.commands.recordings import add_choice, progress
+from designer.commands.recordings import Progress, add_choice
 
 
 def add_recover(commands: Subcommands) -> None:
@@ -29,7 +29,7 @@ def recover_command(options: argparse.Namespace) -> int:
     """`peakmesh recover RECORDING... -o FILE`: exit code 0 where a recording was written, whatever was lost."""
     from agent.contract.recording.recover import recover
 
-    tell = progress()
+    tell = Progress()
     found = recover(
         options.recordings,
         options.output,
