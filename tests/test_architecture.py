@@ -52,8 +52,8 @@ ROOMS = {
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.show": "agent.contract.recording",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.diagnosis designer.gain "
-    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
-    "designer.simulation designer.synthesis designer.what_if",
+    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
+    "designer.search designer.show designer.simulation designer.synthesis designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }

@@ -1,19 +1,22 @@
 """Proof 4 of a replay: every message is there exactly once, and every sender's numbering is whole.
 
 A message that is not there may be *missing*: the run lost it, or somebody took it out. Or it is *lacking*: it was
-left out of this file, as tools do with good reason. A file cannot prove which, so the rule is: it is missing where no
-honest tool explains it, and an honest tool filters by topic or node and by time, splits and joins parts, cuts, or reads
-on after damage. In a file that has its `end`, says that the run finished, and is not damaged, these are lacking:
+left out of this file, as tools do with good reason. A file cannot prove which, so the rule is: nothing is missing from
+a file that is a part of a recording by the looks of it, and honest tools make parts by topic or node and by time, by
+splitting and joining, cutting, or reading on after damage. In a file that has its `end`, says that the run finished,
+and is not damaged, these make it a part:
 
 * a topic of which nothing is there: filtered;
 * a stretch of a topic of at least a tenth of the run: a part was joined in without it;
 * a stretch at about the same time in most topics: a part was left out;
-* the beginning or the end of a topic: filtered by time. But the run's own last event comes after everything else, so
-  where it is there nothing was cut at the end, and where its first event is there no measurement and no estimate was
-  cut at the beginning. This counts only where nothing else is lacking.
+* events that are not there, by the numbers of the coordinator, before or after all that is.
 
-Whatever else is not there is missing. Of a file that is cut, damaged or of a run that did not finish, everything is
-lacking: that is held against it no more than it shows anything. Either is named.
+In a file that is otherwise whole a message between others of its topic is missing. So is one at the beginning or at the
+end of its topic where no filter by time can have taken it alone: the run's own last event comes after everything else,
+and its first one before every measurement and estimate. Where these events are not there it is lacking.
+
+Of a file that is cut, damaged or of a run that did not finish, everything is lacking: that is held against it no more
+than it shows anything. Either is named.
 
 Numbers that a tool has rewritten say nothing, and are told apart from numbers with a fault by how many there are.
 """
@@ -113,9 +116,9 @@ def take_census(
         topics, columns, lacking_of, steps=facts.steps, events=facts.events, recorded=facts.recorded
     )
     lacks, is_part = _explained(holes, topics, facts)
-    if not is_part and not numbering.is_part:
-        lacks &= ~_contradicted(holes, topics, facts)
-    is_part |= bool(lacks.any()) or numbering.is_part
+    is_part |= numbering.is_part
+    lacks = np.ones_like(lacks) if is_part else lacks & ~_contradicted(holes, topics, facts)
+    is_part |= bool(lacks.any())
     unseen = numbering.unseen if facts.is_finished and not is_part else ()
     lacking, missing = _within(holes.where(lacks), topics, part), _within(holes.where(~lacks), topics, part)
     events = numbering.events if is_part or not facts.is_finished else 0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.contract.keys import COORDINATOR, MODE
+from agent.contract.keys import COORDINATOR
 from designer.replay.topics import Columns, Numbers, Topic
 
 SHARE = 20  # faults in more than one number of so many are no faults: a tool has rewritten the numbers
@@ -96,10 +96,17 @@ def read_numbering(
     elif any(sender.is_rewritten(len(events) if sender.who == COORDINATOR else 0) for sender in senders):
         note = "the senders' numbering is not in the file: a tool has rewritten it"
     else:
-        return _own(senders, events)
-    known = recorded.get(COORDINATOR, 0)
-    absent = max(0, known - steps - len(events)) if any(topic.topic == MODE for topic in topics) else 0
+        return _own(senders, events, _absent(senders, steps, events))
+    absent = _absent(senders, steps, events) or 0
     return Numbering(notes=(note,), events=absent, is_part=absent > 0)
+
+
+def _absent(senders: list[_Sender], steps: int, events: Numbers) -> int | None:
+    """How many events are not there, by the recorder's word: what was recorded beside the steps. None: not known."""
+    if not all(sender.recorded for sender in senders):
+        return None
+    beside = sum(sender.recorded - steps * len(sender.topics) for sender in senders)
+    return max(0, beside - len(events))
 
 
 def _senders(
@@ -124,11 +131,12 @@ def _senders(
     ]
 
 
-def _own(senders: list[_Sender], events: Numbers) -> Numbering:
+def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numbering:
     waiting = Counter(events.tolist())
     unseen, total, is_part = [], 0, False
     for sender in senders:
         count, numbers, outermost = sender.unseen(waiting)
+        count = count if absent is None else min(count, absent - total)
         total += count
         if count and (outermost or not len(events)):
             is_part = True

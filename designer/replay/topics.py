@@ -141,7 +141,7 @@ class Topic:
         self.topic, self.who, self.place = topic, who, place
         self.last = -1  # step
         self.copies = 0  # messages that stand there again, equal in content
-        self.double: list[int] = []  # steps of which there is another message, of other content
+        self.double: set[int] = set()  # steps of which there is another message, of other content
         self.faults = Sentences()  # messages that cannot be of this run
         self.unreadable = Sentences()  # messages that are none at all
         self._model, self.places, self._may_be_empty = model, places, may_be_empty
@@ -229,7 +229,7 @@ class Topic:
         if before == now:
             self.copies += 1
         else:
-            self.double.append(step)
+            self.double.add(step)
         number, batch = rows["number"]
         if (batch[at], now) < (number[step], before):
             for column, values in rows.values():

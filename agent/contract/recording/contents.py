@@ -161,7 +161,7 @@ def find_gains(run: Run, surveys: Sequence[Survey], given: Path | None, *, label
             data = _data(survey, attached)
             gains = Gains.from_bytes(data, source=f"{survey.source.path}: gains.json")
         except InputError as error:
-            failures.append(str(error))
+            failures.append(str(error).removesuffix("; design the gains again"))
             continue
         if not wanted or gains.digest() == wanted:
             return gains

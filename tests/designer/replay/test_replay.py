@@ -410,7 +410,9 @@ def test_wrong_gains_are_found_by_their_digest_and_by_their_numbers(tmp_path: Pa
     with pytest.raises(InputError, match=r"gains\.json was altered or exchanged: its digest is [0-9a-f]{12}"):
         replay(path)
     GAINS.save(tmp_path / "gains.json")
-    assert replay(path, gains=tmp_path / "gains.json").agrees
+    verdict = replay(path, gains=tmp_path / "gains.json")
+    assert (verdict.exit_code, verdict.first_divergence) == (1, None)
+    assert "the attachment gains.json was altered or exchanged" in verdict.text()
     path = record(tmp_path / "numbers.mcap", other, TRUE, steps=STEPS)
     verdict = replay(path)
     assert verdict.strange == ()
