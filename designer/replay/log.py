@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, PLANT_STATE, measurement
+from agent.contract.keys import COORDINATOR, EVENT, PLANT, PLANT_STATE, measurement
 from agent.contract.messages import Event
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import Progress, RecordingReader
@@ -245,7 +245,12 @@ class _Content:
     def facts(self, end: dict[str, str], *, steps: int, finished: bool, external: tuple[bool, ...]) -> Facts:
         """What the census must know beside the messages."""
         _, first = np.unique(np.array(self._keys, dtype=np.int64), return_index=True)
-        without_plant = all(external) and self.topics[PLANT_STATE].last < 0
+        recorded = {
+            key.removeprefix("received."): int(count)
+            for key, count in end.items()
+            if key.startswith("received.") and count.isdigit()
+        }
+        without_plant = all(external) and self.topics[PLANT_STATE].last < 0 and not recorded.get(PLANT)
         return Facts(
             steps=steps,
             is_finished=finished,
@@ -253,11 +258,7 @@ class _Content:
             has_end="end" in self._kinds,
             events=np.array(self._events, dtype=np.int64)[first],
             event_copies=len(self._events) - len(first),
-            recorded={
-                key.removeprefix("received."): int(count)
-                for key, count in end.items()
-                if key.startswith("received.") and count.isdigit()
-            },
+            recorded=recorded,
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
         )
 

@@ -42,13 +42,18 @@ class _Sender(NamedTuple):
         numbers = self.numbers
         if len(numbers) < 2:
             return False
-        falls = sum(int((np.diff(of_topic) <= 0).sum()) for _, of_topic in self.topics)
         distinct, most = len(np.unique(numbers)), max(1, len(numbers) // SHARE)
-        if max(falls, len(numbers) - distinct) > most:
+        if self.wrong > most:
             return True
         if self.recorded:
             return int((numbers >= self.recorded).sum()) > most
         return int(numbers.max()) + 1 - distinct - self.lacking - events > max(most, len(numbers) // 2)
+
+    @property
+    def wrong(self) -> int:
+        """How many numbers go against the order of the steps, or stand on more than one message."""
+        falls = sum(int((np.diff(of_topic) <= 0).sum()) for _, of_topic in self.topics)
+        return max(falls, len(self.numbers) - len(np.unique(self.numbers)))
 
     def faults(self) -> Iterator[str]:
         for topic, numbers in self.topics:
@@ -93,7 +98,9 @@ def read_numbering(
     everything = np.concatenate([sender.numbers for sender in senders] or [np.zeros(0, dtype=np.int64)])
     if len(everything) > 1 and not everything.any():
         note = "the senders' numbering is not in the file: every number is 0"
-    elif any(sender.is_rewritten(len(events) if sender.who == COORDINATOR else 0) for sender in senders):
+    elif sum(sender.wrong for sender in senders) > len(everything) // SHARE or any(
+        sender.is_rewritten(len(events) if sender.who == COORDINATOR else 0) for sender in senders
+    ):
         note = "the senders' numbering is not in the file: a tool has rewritten it"
     else:
         return _own(senders, events, _absent(senders, steps, events))
