@@ -282,7 +282,8 @@ def record(
 ) -> Path:
     """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`.
 
-    `received` counts each sender's messages, as the recorder does; where it is not given, those of a whole run.
+    `received` counts each sender's messages, as the recorder does; where it is not given, those of a whole run, and
+    of one without a plant where nothing of it is there and no node needs it.
     """
     run = {"run": "test", "seed": str(seed), "steps": str(steps), "gains": gains.digest(), "external": "", **facts}
     with RecordingWriter(path, run=run, gains=gains) as writer:
@@ -290,7 +291,10 @@ def record(
             payload = canonical(message.document)
             writer.add(Logged(message.topic, payload, message.number, time, time))
         if whole:
-            counts = whole_run(gains.problem, steps, facts.get("external", "")) if received is None else received
+            external = facts.get("external", "")
+            counts = whole_run(gains.problem, steps, external) if received is None else dict(received)
+            if received is None and len(external.split(",")) == gains.problem.n:
+                counts = {who: count for who, count in counts.items() if any(message.who == who for message in sent)}
             end = {"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)}
             writer.finish(end | {f"received.{who}": str(count) for who, count in counts.items()})
     return path if whole else path.with_name(path.name + ".part")
