@@ -27,7 +27,7 @@ from agent.contract.problem import Problem
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
 from designer.replay.gamma import checked_gamma
-from designer.replay.inputs import draw, logged_inputs, logged_states
+from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
 from designer.replay.part import Part
 from designer.replay.proofs import Check
@@ -199,13 +199,13 @@ class PathAudit:
 def _compare(log: Log, central: Central, tally: Tally, report: Report) -> tuple[PathAudit, float] | None:
     """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
     drawn = draw(log, central)
-    inputs, eta = logged_inputs(log, central, drawn), logged_states(log, central)
+    inputs = logged_inputs(log, central, drawn)
     hears = proofs.to_be_heard(log, central, drawn)
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
         now = slice(first, min(first + _STEPS_AT_ONCE, log.steps))
         tally.add(proofs.input_checks(log, central, drawn, now))
-        tally.add(proofs.step_checks(log, central, inputs, eta, now))
+        tally.add(proofs.step_checks(log, central, inputs, now))
         tally.add(proofs.message_checks(log, central, hears, now))
         report("comparing, first pass", now.stop, log.steps)
     whole = free_run.complete(inputs, drawn, log, central)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.keys import COORDINATOR
 from designer.replay.topics import Columns, Numbers, Topic
+
+Stored = NDArray[np.uint32]
 
 SHARE = 20  # faults in more than one number of so many are no faults: a tool has rewritten the numbers
 _SHOWN = 5
@@ -25,63 +27,57 @@ class Numbering(NamedTuple):
     is_part: bool = False  # these lack as they do where a part was taken
 
 
-class _Sender(NamedTuple):
+class _Sender:
     """One sender's numbers."""
 
-    who: str
-    topics: list[tuple[str, Numbers]]  # in the order of the steps
-    lacking: int  # steps of which there is nothing, over all topics
-    recorded: int  # by the word of the recorder; 0 where that is not known
-
-    @property
-    def numbers(self) -> Numbers:
-        return np.concatenate([numbers for _, numbers in self.topics])
+    def __init__(self, who: str, topics: list[tuple[str, Stored]], *, lacking: int, recorded: int) -> None:
+        """`topics` have their numbers in the order of the steps, of which `lacking` over all topics are not there;
+        `recorded` messages were by the word of the recorder, 0 where that is not known."""
+        self.who, self.topics, self.recorded = who, [topic for topic, _ in topics], recorded
+        self._lacking = lacking
+        falls = [(topic, numbers, np.flatnonzero(numbers[1:] <= numbers[:-1])) for topic, numbers in topics]
+        self._falls = [
+            f"{topic} has number {numbers[at[0] + 1]} after {numbers[at[0]]}, against the order of its steps"
+            for topic, numbers, at in falls
+            if len(at)
+        ]
+        every = np.sort(np.concatenate([numbers for _, numbers in topics]))
+        self._again = every[1:][every[1:] == every[:-1]]
+        self.total = len(every)
+        self.wrong = max(sum(len(at) for _, _, at in falls), len(self._again))  # faults in them
+        self.numbers = every[np.concatenate([[True], every[1:] != every[:-1]])[: len(every)]]  # distinct, ascending
 
     def is_rewritten(self, events: int) -> bool:
         """These cannot be the sender's own numbers, or hardly."""
-        numbers = self.numbers
-        if len(numbers) < 2:
+        if self.total < 2:
             return False
-        distinct, most = len(np.unique(numbers)), max(1, len(numbers) // SHARE)
+        most, last = max(1, self.total // SHARE), int(self.numbers[-1])
         if self.wrong > most:
             return True
         if self.recorded:
-            return int((numbers >= self.recorded).sum()) > most
-        return int(numbers.max()) + 1 - distinct - self.lacking - events > max(most, len(numbers) // 2)
+            return int((self.numbers >= self.recorded).sum()) > most
+        return last + 1 - len(self.numbers) - self._lacking - events > max(most, self.total // 2)
 
-    @property
-    def wrong(self) -> int:
-        """How many numbers go against the order of the steps, or stand on more than one message."""
-        falls = sum(int((np.diff(of_topic) <= 0).sum()) for _, of_topic in self.topics)
-        return max(falls, len(self.numbers) - len(np.unique(self.numbers)))
-
-    def faults(self) -> Iterator[str]:
-        for topic, numbers in self.topics:
-            falls = np.flatnonzero(np.diff(numbers) <= 0)
-            if len(falls):
-                before, after = numbers[falls[0]], numbers[falls[0] + 1]
-                yield f"{topic} has number {after} after {before}, against the order of its steps"
-        distinct, counts = np.unique(self.numbers, return_counts=True)
-        if (counts > 1).any():
-            yield f"{self.who} has number {distinct[counts > 1][0]} on more than one message"
+    def faults(self) -> list[str]:
+        again = [f"{self.who} has number {self._again[0]} on more than one message"] if len(self._again) else []
+        return [*self._falls, *again]
 
     def unseen(self, events: Counter[int]) -> tuple[int, list[int], bool]:
         """How many messages neither topics nor events explain, the numbers nobody has, and whether all are outermost.
 
         The events that fill a gap are used up.
         """
-        there = np.unique(self.numbers)
-        total = self.recorded or int(there.max(initial=-1)) + 1
-        there = there[there < total]
+        total = self.recorded or (int(self.numbers[-1]) + 1 if self.total else 0)
+        there = self.numbers[self.numbers < total]
         is_there = np.zeros(total, dtype=bool)
         is_there[there] = True
         gaps = np.flatnonzero(~is_there)
         filled = [number for number in gaps.tolist() if events[number] > 0]
         events.subtract(filled)
         gaps = np.setdiff1d(gaps, filled)
-        known = np.union1d(there, filled)
-        outermost = bool(len(known)) and bool(((gaps < known[0]) | (gaps > known[-1])).all())
-        return max(0, len(gaps) - self.lacking), gaps[:_SHOWN].tolist(), outermost
+        ends = [*filled, *there[:1].tolist(), *there[-1:].tolist()]
+        outermost = bool(ends) and bool(((gaps < min(ends)) | (gaps > max(ends))).all())
+        return max(0, len(gaps) - self._lacking), gaps[:_SHOWN].tolist(), outermost
 
 
 def read_numbering(
@@ -95,10 +91,10 @@ def read_numbering(
 ) -> Numbering:
     """`lacking` counts the steps below `steps` that each topic lacks, `events` are the numbers of the events."""
     senders = _senders(topics, columns, lacking, steps, recorded)
-    everything = np.concatenate([sender.numbers for sender in senders] or [np.zeros(0, dtype=np.int64)])
-    if len(everything) > 1 and not everything.any():
+    total = sum(sender.total for sender in senders)
+    if total > 1 and not any(sender.numbers.any() for sender in senders):
         note = "the senders' numbering is not in the file: every number is 0"
-    elif sum(sender.wrong for sender in senders) > len(everything) // SHARE or any(
+    elif sum(sender.wrong for sender in senders) > total // SHARE or any(
         sender.is_rewritten(len(events) if sender.who == COORDINATOR else 0) for sender in senders
     ):
         note = "the senders' numbering is not in the file: a tool has rewritten it"
@@ -127,12 +123,9 @@ def _senders(
     return [
         _Sender(
             who,
-            [
-                (topic.topic, number[np.flatnonzero(has[:, topic.place]), topic.place].astype(np.int64))
-                for topic in of_sender
-            ],
-            sum(lacking[topic.topic] for topic in of_sender),
-            recorded.get(who, 0),
+            [(topic.topic, number[:steps, topic.place][has[:, topic.place]]) for topic in of_sender],
+            lacking=sum(lacking[topic.topic] for topic in of_sender),
+            recorded=recorded.get(who, 0),
         )
         for who, of_sender in sorted(found.items())
     ]
