@@ -138,6 +138,8 @@ def _log(
         strange=strange,
         part=part,
     )
+    if census.duplicates.total and not reader.is_alone:
+        raise InputError(f"{reader.label} holds runs that went on at the same time; their messages cannot be parted")
     columns.release("number", "time")
     return Log(
         path=reader.path,

@@ -22,9 +22,9 @@ from agent.contract.recording.records import Attached
 from agent.contract.recording.survey import Survey
 
 IDENTITY = ("run", "gains", "problem_digest", "seed", "steps", "started")  # metadata that make two records one run
-OURS = {"run", "end"}  # metadata
 CONTINUES = "continues"  # the status at the end of a part that another one follows
 ATTACHED = {"gains.json", "problem.json", "layout.json"}
+_DIGESTS = (("problem.json", "problem_digest", Problem), ("gains.json", "gains", Gains))  # that the run names
 _LARGEST = 1 << 28  # bytes of an attachment that is looked into
 
 Facts = dict[str, str]
@@ -57,8 +57,8 @@ def runs_in(surveys: Sequence[Survey]) -> list[Run]:
     """
     found: dict[tuple[str, ...], Run] = {}
     for survey in surveys:
-        begun = [facts for name, facts in survey.metadata if name == "run" and facts.get("format") == FORMAT]
-        ended = [facts for name, facts in survey.metadata if name == "end" and "status" in facts]
+        begun = [facts for name, facts in survey.metadata if name == "run" and is_ours(name, facts)]
+        ended = [facts for name, facts in survey.metadata if name == "end" and is_ours(name, facts)]
         for facts, end in zip(begun, _ends(begun, ended), strict=True):
             key = _identity(facts)
             before = found.get(key, Run(facts, None))
@@ -66,6 +66,11 @@ def runs_in(surveys: Sequence[Survey]) -> list[Run]:
     if not found:
         raise InputError(_no_run(surveys))
     return list(found.values())
+
+
+def is_ours(name: str, facts: Facts) -> bool:
+    """Whether metadata are those of a run of peakmesh."""
+    return (name == "run" and facts.get("format") == FORMAT) or (name == "end" and "status" in facts)
 
 
 def _identity(facts: Facts) -> tuple[str, ...]:
@@ -186,9 +191,9 @@ def _no_gains(failures: list[str], wanted: str, surveys: Sequence[Survey], label
 
 def altered(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
     """Of the attachments whose digests the run names, those of which there is none that fits, a sentence each."""
-    for name, key, model in (("problem.json", "problem_digest", Problem), ("gains.json", "gains", Gains)):
-        found = [_digest(survey, attached, model) for survey, attached in _named(name, surveys)]
-        wanted = run.facts.get(key)
+    for name, key, model in _DIGESTS:
+        wanted = run.facts.get(key, "")
+        found = [_digest(survey, attached, model, wanted) for survey, attached in _named(name, surveys)]
         if wanted and found and wanted not in found:
             yield (
                 f"the attachment {name} was altered or exchanged: its digest is {found[-1][:12]}..., "
@@ -196,9 +201,23 @@ def altered(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
             )
 
 
-def _digest(survey: Survey, attached: Attached, model: type[Problem] | type[Gains]) -> str:
-    """Of what is in an attachment, whatever its spaces; of its bytes where that is something else."""
+def strangers(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
+    """Metadata and attachments of others, by name."""
+    for survey in surveys:
+        yield from (name for name, facts in survey.metadata if not is_ours(name, facts))
+        yield from (attached.name for attached in survey.attachments if attached.name not in ATTACHED)
+    for name, key, model in _DIGESTS:
+        wanted = run.facts.get(key, "")
+        found = [_digest(survey, attached, model, wanted) for survey, attached in _named(name, surveys)]
+        if wanted in found:
+            yield from (name for digest in found if digest != wanted)
+
+
+def _digest(survey: Survey, attached: Attached, model: type[Problem] | type[Gains], wanted: str) -> str:
+    """Of what is in an attachment, whatever its spaces; of its bytes where that is something else, or is `wanted`."""
     data = survey.source.read(attached.start, min(attached.size, _LARGEST))
+    if hashlib.sha256(data).hexdigest() == wanted:
+        return wanted
     try:
         return model.model_validate(json.loads(data)).digest()
     except (ValueError, RecursionError):

@@ -30,10 +30,10 @@ class RecordingReader:
 
     `run` and `gains` are there at once; `end` is None where the run's last word is missing. What is wrong with the
     file is in `damage`, "" where nothing is, and what is odd but harmless in `notes`; both are complete after
-    `messages()` has been read to its end, and so are `foreign`, the messages of others, and `orphans`.
+    `messages()` has been read to its end, and so are `foreign` and `others`. `is_alone`: the files hold no other run.
 
-    `run` chooses among several runs by name, `gains` gives a gains file where it was left out. Without
-    `needs_gains` a recording that lost its gains is read too, and `gains` is then refused when it is asked for.
+    The argument `run` chooses among several runs by name or start, `gains` gives the gains file where it was left out.
+    Without `needs_gains` a recording that lost its gains is read too, and `gains` is refused when it is asked for.
     """
 
     def __init__(
@@ -59,6 +59,7 @@ class RecordingReader:
                 self._sources.append(Source(one))
             self._surveys = [survey(source) for source in self._sources]
             runs = contents.runs_in(self._surveys)
+            self.is_alone = len(runs) == 1
             self._chosen = contents.chosen(runs, run, label=label)
             self.window = contents.window(self._chosen, runs, label=label)
             self._gains: Gains | None = None
@@ -114,9 +115,7 @@ class RecordingReader:
     @property
     def strangers(self) -> list[str]:
         """Metadata and attachments of others, by name."""
-        names = [name for one in self._surveys for name, facts in one.metadata if name not in contents.OURS]
-        attached = [found.name for one in self._surveys for found in one.attachments]
-        return list(dict.fromkeys([*names, *(name for name in attached if name not in contents.ATTACHED)]))
+        return list(dict.fromkeys(contents.strangers(self._chosen, self._surveys)))
 
     @property
     def faults(self) -> list[str]:

@@ -78,9 +78,12 @@ class Source:
         count = max(0, min(count, self.size - start))
         try:
             self._file.seek(start)
-            return self._file.read(count)
+            data = self._file.read(count)
         except OSError as error:
             raise InputError(f"{self.path} could not be read on at byte {start}: {error.strerror}") from error
+        if len(data) < count:
+            raise InputError(f"{self.path} became shorter while it was read: it ends at byte {start + len(data)} now")
+        return data
 
     def checksum(self, start: int, end: int) -> int:
         """CRC-32 of the bytes [start, end)."""

@@ -81,7 +81,10 @@ def survey(source: Source) -> Survey:
     found = Survey(source, damage=list(source.damage), notes=list(source.notes))
     if not source.size:
         raise InputError(f"{source.path} is empty; a recording was expected there")
-    if source.read(0, len(MAGIC)) != MAGIC and source.read(len(MAGIC), FRAME.size)[:1] != bytes([records.HEADER]):
+    magic = source.read(0, len(MAGIC))
+    if magic != MAGIC and magic[:5] == MAGIC[:5] and magic[6:] == MAGIC[6:]:
+        raise InputError(f"{source.path} is an MCAP file of version {chr(magic[5])}; this peakmesh reads version 0")
+    if magic != MAGIC and source.read(len(MAGIC), FRAME.size)[:1] != bytes([records.HEADER]):
         raise InputError(f"{source.path} is not a recording: it is not an MCAP file")
     _Walk(found).run()
     return found
