@@ -272,17 +272,20 @@ def _strangers(reader: RecordingReader, others: Counter[str]) -> list[str]:
     lines = []
     topics = reader.foreign + others
     if topics:
-        names = ", ".join(sorted(topics)[:_NAMED]) + (
-            f" and {len(topics) - _NAMED} more" if len(topics) > _NAMED else ""
-        )
+        names = _some(sorted(topics))
         of = counted(len(topics), "topic")
         be = "is" if topics.total() == 1 else "are"
         lines.append(f"{counted(topics.total(), 'message')} on {of} {be} not of this run, and {be} left alone: {names}")
     if reader.others:
         lines.append(f"{counted(reader.others, 'message')} of other runs are left alone")
     if reader.strangers:
-        lines.append(f"metadata and attachments of others are left alone: {', '.join(reader.strangers[:_NAMED])}")
+        lines.append(f"metadata and attachments of others are left alone: {_some(reader.strangers)}")
     return lines
+
+
+def _some(names: list[str]) -> str:
+    """The first of them, and whether there are more."""
+    return ", ".join([*names[: 2 * _NAMED], *(["..."] if len(names) > 2 * _NAMED else [])])
 
 
 def _refuse_hollow(columns: Columns, steps: int, messages: int, *, path: Path) -> None:

@@ -259,7 +259,7 @@ class Verdict:
         if self.damage:
             lines.append(f"the file: {self.damage}")
         if self.gaps:
-            how = "not in this file" if self.status == "cut" or self.damage else "left out of this file"
+            how = "not in this file" if self.status in ("cut", "continues") or self.damage else "left out of this file"
             lines.append(f"{how}: {counted(self.lacking.total, 'message')} ({'; '.join(self.gaps)})")
         return [*lines, *(f"note: {note}" for note in self.notes)]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from agent.contract.errors import counted
+from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
 from agent.contract.recording import Logged, contents, records
 from agent.contract.recording.contents import Run
@@ -58,9 +58,13 @@ class RecordingReader:
             for one in self.paths[len(self._sources) :]:
                 self._sources.append(Source(one))
             self._surveys = [survey(source) for source in self._sources]
+            self._followed: list[Path] = []
             runs = contents.runs_in(self._surveys)
-            self.is_alone = len(runs) == 1
             self._chosen = contents.chosen(runs, run, label=label)
+            while self._follow():
+                runs = contents.runs_in(self._surveys)
+                self._chosen = contents.chosen(runs, run, label=label)
+            self.is_alone = len(runs) == 1
             self.window = contents.window(self._chosen, runs, label=label)
             self._gains: Gains | None = None
             self._given = gains
@@ -71,6 +75,29 @@ class RecordingReader:
             raise
         self.run, self.end = self._chosen.facts, self._chosen.end
         self.size = sum(source.size for source in self._sources)
+
+    def _follow(self) -> bool:
+        """Take in the next part of a run that continues, where it stands beside this file; False where none does."""
+        end = self._chosen.end
+        name = end.get("next", "") if end is not None and end["status"] == contents.CONTINUES else ""
+        if not name or Path(name).name != name:
+            return False
+        here = self.path.parent
+        there = [path for path in (here / name, here / f"{name}.part") if path.exists()]
+        if not there or there[0] in (*self.paths, *self._followed):
+            return False
+        source = Source(there[0])
+        self._sources.append(source)
+        try:
+            part = survey(source)
+            if any(other.identity == self._chosen.identity for other in contents.runs_in([part])):
+                self._surveys.append(part)
+                self._followed.append(there[0])
+                return True
+        except InputError:  # it was killed before it had a head: the run ends here
+            pass
+        self._sources.pop().close()
+        return False
 
     @property
     def gains(self) -> Gains:
@@ -108,6 +135,8 @@ class RecordingReader:
     def notes(self) -> list[str]:
         """What is odd, and harms nothing."""
         found = [self._of(one, sentence) for one in self._surveys for sentence in one.notes]
+        if self._followed:
+            found.append(f"it goes on in {', '.join(path.name for path in self._followed)}, which was read with it")
         if self.is_unchecked:
             found.append("no checksum covers the messages: what was changed later cannot be told from what was sent")
         return found

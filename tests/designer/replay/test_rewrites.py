@@ -447,3 +447,22 @@ def judged(path: Path) -> Verdict | None:
     assert sentence.startswith(str(path))
     assert "\n" not in sentence
     return None
+
+
+def test_the_next_parts_beside_a_recording_are_read_with_it(tmp_path: Path, honest: Contents) -> None:
+    """By the names that the recorder gives them, the last one unfinished or not."""
+    parts = parts_of_a_recorder(honest, 3)
+    for name, part in zip(("run.mcap", "run.part2.mcap", "run.part3.mcap"), parts, strict=True):
+        write(tmp_path / name, part)
+    verdict = replay(tmp_path / "run.mcap")
+    assert verdict.exit_code == 0, verdict.text()
+    assert "note: it goes on in run.part2.mcap, run.part3.mcap, which was read with it" in verdict.text()
+    data = (tmp_path / "run.part3.mcap").read_bytes()
+    (tmp_path / "run.part3.mcap").unlink()
+    for share, left in ((0.5, 3), (0.001, 2)):  # killed while it was written, or before it had a head
+        (tmp_path / "run.part3.mcap.part").write_bytes(data[: int(share * len(data))])
+        verdict = replay(tmp_path / "run.mcap")
+        assert (verdict.outcome, verdict.status, verdict.missing.total) == ("agrees for what is there", "continues", 0)
+        assert verdict.text().count("mcap.part,") == left - 2
+    write(tmp_path / "run.part2.mcap", read(recorded(tmp_path / "other.mcap", seed=9, name="other")))
+    assert replay(tmp_path / "run.mcap").messages == len(messages_of(parts[0]))
