@@ -6,7 +6,7 @@ a file that is a part of a recording by the looks of it, and honest tools make p
 splitting and joining, cutting, or reading on after damage. In a file that has its `end`, says that the run finished,
 and is not damaged, these make it a part:
 
-* a topic of which nothing is there: filtered;
+* a topic of which nothing is there: filtered; or a quarter is not there: thinned;
 * a stretch of a topic of at least a tenth of the run: a part was joined in without it;
 * a stretch at about the same time in most topics: a part was left out;
 * events that are not there, by the numbers of the coordinator, before or after all that is.
@@ -18,7 +18,8 @@ and its first one before every measurement and estimate. Where these events are 
 Of a file that is cut, damaged or of a run that did not finish, everything is lacking: that is held against it no more
 than it shows anything. Either is named.
 
-Numbers that a tool has rewritten say nothing, and are told apart from numbers with a fault by how many there are.
+Numbers that a tool has rewritten say nothing, and are told apart from numbers with a fault by how many there are. In a
+part too few may be left to tell, so faults of theirs are noted there, and held against nobody.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from designer.replay.part import Part
 from designer.replay.topics import NAMED, Columns, Numbers, Topic
 
 PART = 10  # a stretch of a tenth of the run may be a part
+THINNED = 4  # a topic that lacks a quarter of its messages was thinned
 INNER = 3  # so many stretches and topics are named
 
 Flags = NDArray[np.bool_]
@@ -119,7 +121,7 @@ def take_census(
     is_part |= numbering.is_part
     lacks = np.ones_like(lacks) if is_part else lacks & ~_contradicted(holes, topics, facts)
     is_part |= bool(lacks.any())
-    unseen = numbering.unseen if facts.is_finished and not is_part else ()
+    unseen = numbering.unseen if facts.is_finished else ()
     lacking, missing = _within(holes.where(lacks), topics, part), _within(holes.where(~lacks), topics, part)
     events = numbering.events if is_part or not facts.is_finished else 0
     copies = sum(topic.copies for topic in topics) + facts.event_copies
@@ -134,8 +136,8 @@ def take_census(
         duplicates=Faults(len(double), tuple(sorted(double, key=_by_step)[:NAMED])),
         copies=copies,
         strange=tuple(strange),
-        numbering=(*numbering.faults, *unseen),
-        notes=(*numbering.notes, *again),
+        numbering=() if is_part else (*numbering.faults, *unseen),
+        notes=(*numbering.notes, *(numbering.faults if is_part else ()), *again),
     )
 
 
@@ -183,6 +185,8 @@ def _explained(holes: Holes, topics: list[Topic], facts: Facts) -> tuple[Flags, 
     begins, ends = holes.first == 0, holes.last == facts.steps - 1
     parts = (begins & ends) | (holes.length >= max(2, facts.steps // PART))
     present = len(topics) - int((begins & ends).sum())
+    lacking = np.bincount(holes.topic, weights=holes.length, minlength=len(topics))
+    parts |= (lacking >= max(2.0, facts.steps / THINNED))[holes.topic]
     parts |= _common(holes, present)
     return parts | begins | ends, bool(parts.any())
 

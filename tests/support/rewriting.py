@@ -283,6 +283,19 @@ def joined_without_a_part(contents: Contents, chance: random.Random) -> Contents
     return merged(parts, chance)
 
 
+def thinned(contents: Contents, chance: random.Random) -> Contents:
+    """Every second or third message of some topics."""
+    topics = sorted({item.topic for item in contents.items})
+    some = set(chance.sample(topics, chance.randint(1, max(1, len(topics) // 2)))) if topics else set()
+    every, counts = chance.randint(2, 3), dict.fromkeys(topics, -1)
+    kept = []
+    for item in contents.items:
+        counts[item.topic] += 1
+        if item.topic not in some or counts[item.topic] % every == 0:
+            kept.append(item)
+    return contents.with_items(kept)
+
+
 def without_the_end(contents: Contents, chance: random.Random) -> Contents:
     return replace(contents, metadata=tuple(record for record in contents.metadata if record[0] != "end"))
 
@@ -295,6 +308,7 @@ PARTIAL: tuple[Rewrite, ...] = (
     first_half,
     second_half,
     joined_without_a_part,
+    thinned,
     without_the_end,
 )
 

@@ -10,6 +10,7 @@ from agent.contract.recording.records import Broken, Channel, Schema
 from agent.contract.recording.survey import Survey
 
 TOPIC = re.compile(r"(.*/)?(mode|plant/state|event|evidence|node/[^/]+/(?:measurement|estimate))", re.DOTALL)
+ENCODINGS = ("json", "")  # of their messages
 SCHEMAS = "peakmesh."  # what the names of our schemas begin with
 _CHUNKS = 8  # looked into for channels where none is described outside chunks
 
@@ -31,18 +32,19 @@ class Naming:
                 ambiguous.add(channel.id)  # files were joined
         for number in ambiguous:
             del self._described[number]
-        under: defaultdict[str, set[str]] = defaultdict(set)
+        under: defaultdict[str, set[tuple[bool, str]]] = defaultdict(set)
         for channel in channels:
             match = TOPIC.fullmatch(channel.topic)
-            if match is not None:
-                under[match[1] or ""].add(match[2])
-        self.prefix = min(under, key=lambda prefix: (-len(under[prefix]), len(prefix), prefix), default="")
+            if match is not None and channel.encoding in ENCODINGS:
+                under[match[1] or ""].add((self._is_named(channel), match[2]))
+        weights = {prefix: (sum(named for named, _ in found), len(found)) for prefix, found in under.items()}
+        self.prefix = min(weights, key=lambda prefix: (*(-weight for weight in weights[prefix]), prefix), default="")
         self._named = {self._topic(channel) for channel in channels if self._is_named(channel)}
 
     def topic(self, channel: Channel) -> str | None:
         """The topic of a run that a channel has; None where it is somebody else's."""
         topic = self._topic(channel)
-        if topic is None or channel.encoding not in ("json", ""):
+        if topic is None or channel.encoding not in ENCODINGS:
             return None
         return topic if topic not in self._named or self._is_named(channel) else None
 
