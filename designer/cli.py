@@ -13,7 +13,7 @@ from importlib.metadata import version
 import agent.cli
 from agent.commands.roles import add_roles
 from agent.contract.errors import EXIT_INPUT
-from designer.commands import analyse, design, recordings, report, reproduce, runs, show, simulate, verify
+from designer.commands import analyse, design, recordings, recover, report, reproduce, runs, show, simulate, verify
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verify.add_verify(commands)
     runs.add_run(commands)
     recordings.add_replay(commands)
+    recover.add_recover(commands)
     simulate.add_simulate(commands)
     report.add_report(commands)
     reproduce.add_reproduce(commands)

@@ -7,19 +7,28 @@ from pathlib import Path
 from typing import Any
 
 from agent.contract.errors import InputError, counted, listed
-from agent.contract.files import read_bytes
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from agent.contract.recording.reader import RecordingReader
+from agent.contract.recording.reader import Progress, RecordingReader
+from agent.contract.recording.source import Source
 
 MCAP_MAGIC = b"\x89MCAP"
+LARGEST = 1 << 28  # bytes of a problem or gains file
 PROBLEMS = Path(__file__).parent / "problems"
 
 
-def describe(file: str | Path | None = None) -> dict[str, Any]:
+def describe(
+    file: str | Path | None = None,
+    *,
+    run: str | None = None,
+    gains: Path | None = None,
+    report: Progress | None = None,
+) -> dict[str, Any]:
     """The facts of a file, or of a built-in problem given by its name; without one, the built-in problems.
 
-    `kind` is "problem", "gains", "recording" or "built-in problems". Raises InputError for anything else.
+    `kind` is "problem", "gains", "recording" or "built-in problems". Of a recording, `run` chooses among several runs,
+    `gains` is the gains file where a tool left its own out, and `report` is told the bytes read, and of how many. The
+    file is read once, so it may be a pipe. Raises InputError for anything else.
     """
     if file is None:
         return {"kind": "built-in problems", "problems": {name: _size(_built_in(name)) for name in built_in_names()}}
@@ -28,9 +37,16 @@ def describe(file: str | Path | None = None) -> dict[str, Any]:
         if str(file) in built_in_names():
             return _problem(_built_in(str(file)))
         raise InputError(f"{path} does not exist, nor is it a built-in problem; these are {listed(built_in_names())}")
-    data = read_bytes(path, kind="problem, gains file or recording")
-    if data.startswith(MCAP_MAGIC):
-        return {"file": str(path), **_recording(path)}
+    source = Source(path, kind="problem, gains file or recording")
+    try:
+        if source.read(0, len(MCAP_MAGIC)) == MCAP_MAGIC:
+            with RecordingReader(source, run=run, gains=gains, needs_gains=False) as reader:
+                return {"file": str(path), **_recording(reader, report)}
+        if source.size > LARGEST:
+            raise InputError(f"{path} has {source.size} bytes, and does not begin as a recording (MCAP) does")
+        data = source.read(0, source.size)
+    finally:
+        source.close()
     if data.lstrip().startswith(b"{"):
         return {"file": str(path), **_gains(Gains.from_bytes(data, source=str(path)))}
     if path.suffix == ".toml":
@@ -46,6 +62,8 @@ def text(facts: dict[str, Any]) -> str:
         facts = facts | {"messages": _by_kind(facts["messages"])}
     if "holds" in facts:
         facts = _as_claim(facts)
+    if "others" in facts:
+        facts = facts | {"others": list(facts["others"]), "notes": "; ".join(facts["notes"])}
     width = max(map(len, facts)) + 2
     return "\n".join(f"{name.replace('_', ' '):{width}}{_plain(value)}" for name, value in facts.items())
 
@@ -119,18 +137,21 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in shown.items() if name not in {"holds", "verified", *absent}}
 
 
-def _recording(path: Path) -> dict[str, Any]:
-    with RecordingReader(path) as reader:
-        counts = Counter(logged.topic for logged in reader.messages())
-        run, end, gains = reader.run, reader.end or {}, reader.gains
+def _recording(reader: RecordingReader, report: Progress | None) -> dict[str, Any]:
+    counts = Counter(logged.topic for logged in reader.messages(report))
+    run, end, notes = reader.run, reader.end or {}, [*reader.notes]
+    try:
+        gains: Gains | None = reader.gains
+    except InputError as error:
+        gains = None
+        notes.append(str(error).removeprefix(f"{reader.path} ").removeprefix(f"{reader.path}: "))
     return {
         "kind": "recording",
         "run": run.get("run", ""),
-        "problem": gains.problem.name,
-        "size": _size(gains.problem),
-        "gains": gains.digest(),
-        "gamma": gains.certificate.gamma,
-        "holds": gains.certificate.holds,
+        "problem": run.get("problem", "") if gains is None else gains.problem.name,
+        "size": "" if gains is None else _size(gains.problem),
+        "gains": run.get("gains", "") if gains is None else gains.digest(),
+        **({} if gains is None else {"gamma": gains.certificate.gamma, "holds": gains.certificate.holds}),
         "seed": run.get("seed", ""),
         "steps": run.get("steps", ""),
         "complete_steps": end.get("steps"),
@@ -145,6 +166,8 @@ def _recording(path: Path) -> dict[str, Any]:
         "status": end.get("status", "cut: it has no end"),
         "reason": end.get("reason", ""),
         "damage": reader.damage,
+        "notes": [*notes, *reader.faults],
+        "others": {**reader.foreign, **dict.fromkeys(reader.strangers)},
     }
 
 

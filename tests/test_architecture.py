@@ -51,9 +51,9 @@ ROOMS = {
     "designer.replay": "agent.contract.recording designer.model designer.proof",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.show": "agent.contract.recording",
-    "designer.commands": "agent.commands designer.analysis designer.diagnosis designer.gain designer.ladder "
-    "designer.problems designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
-    "designer.simulation designer.synthesis designer.what_if",
+    "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.diagnosis designer.gain "
+    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
+    "designer.search designer.show designer.simulation designer.synthesis designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
@@ -63,6 +63,7 @@ DOORS = {
     "zenoh": ["agent/network/session.py"],
     "mcap": ["agent/contract/recording/"],
     "zstandard": ["agent/contract/recording/"],
+    "lz4": ["agent/contract/recording/"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
     "scipy": ["designer/lmi/", "designer/gain/exact.py"],

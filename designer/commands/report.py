@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite, write_whole
+from designer.commands.recordings import add_choice
 
 if TYPE_CHECKING:
     from designer.report.account import Account
@@ -24,6 +25,7 @@ def add_report(commands: Subcommands) -> None:
     )
     report.add_argument("recording", type=Path, metavar="RECORDING", help="recording, or the .part of one that was cut")
     report.add_argument("-o", "--output", type=Path, metavar="FILE", help="HTML file (RECORDING.html)")
+    add_choice(report)
     add_figures(report, "write every picture for a paper into this folder; the page only where --output names it")
     report.add_argument("--data", action="store_true", help="with --figures: the numbers behind each as CSV beside it")
     report.add_argument("--force", action="store_true", help="replace files that exist")
@@ -41,8 +43,8 @@ def add_figures(parser: argparse.ArgumentParser, about: str) -> None:
 def report_command(options: argparse.Namespace) -> int:
     """`peakmesh report RECORDING`: the exit code says that it was written; the verdict is replay's to give.
 
-    The object of --json: recording, agrees and finished as replay says them, report (the page, or null), figures and
-    data (files).
+    The object of --json: recording, agrees, finished and whole as replay says them, report (the page, or null), figures
+    and data (files).
     """
     refuse_lone_options(options)
     output = options.output
@@ -52,7 +54,7 @@ def report_command(options: argparse.Namespace) -> int:
         refuse_page(output, options.recording, force=options.force)
     from designer.report.account import Account
 
-    account = Account.of(options.recording)
+    account = Account.of(options.recording, run=options.run, gains=options.gains)
     figures, data = write_figures(account, options) if options.figures is not None else ([], [])
     if output is not None:
         write_page(account, output, force=options.force)
@@ -60,6 +62,7 @@ def report_command(options: argparse.Namespace) -> int:
         "recording": str(options.recording),
         "agrees": account.verdict.agrees,
         "finished": account.verdict.finished,
+        "whole": account.verdict.whole,
         "report": None if output is None else str(output),
         "figures": [str(path) for path in figures],
         "data": [str(path) for path in data],
@@ -119,4 +122,4 @@ def _text(facts: dict[str, Any], folder: Path | None) -> str:
     for name in ("figures", "data"):
         lines += [f"{name:10} {len(facts[name])} files in {folder}"] if facts[name] else []
     verdict = "the recording agrees" if facts["agrees"] else "the recording DIVERGES"
-    return "\n".join([*lines, f"verdict    {verdict}{'' if facts['finished'] else '; it is not whole'}"])
+    return "\n".join([*lines, f"verdict    {verdict}{'' if facts['whole'] else '; it is not whole'}"])

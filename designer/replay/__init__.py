@@ -17,7 +17,8 @@ whole network. It never imports the runtime's filter.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -26,12 +27,14 @@ from agent.contract.problem import Problem
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
 from designer.replay.gamma import checked_gamma
-from designer.replay.inputs import draw, logged_inputs, logged_states
+from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
+from designer.replay.part import Part
 from designer.replay.proofs import Check
 from designer.replay.trace import Trace
-from designer.replay.verdict import Divergence, Peak, Proof, Verdict
+from designer.replay.verdict import Divergence, Peak, Proof, Verdict, kind_of
 
+Report = Callable[[str, int, int], None]  # what is being done, how much of it, and of how much
 UNIT: float = 2.0**-53  # the relative error of one float64 operation
 _STEPS_AT_ONCE = 1024
 _NUMBERS_AT_ONCE = 2_000_000  # of output covariances held at once, 16 MB
@@ -70,32 +73,48 @@ def tolerance(problem: Problem) -> float:
     return float((factor * (n_eta + ny + problem.nw + problem.n + 4) + rounded) * UNIT)
 
 
-def replay(path: FilePath) -> Verdict:
-    """Read a recording and judge it. Raises InputError for a file that is no recording."""
-    return judge(load(path))
+def replay(
+    path: FilePath | Sequence[FilePath],
+    *,
+    run: str | None = None,
+    gains: FilePath | None = None,
+    part: Part | None = None,
+    report: Report | None = None,
+) -> Verdict:
+    """Read a recording, or the files that hold parts of one, and judge it. Raises InputError for what is none.
+
+    `run` and `gains` as in `load`; `part` is what alone is judged. `report` is told what is being done, how far that
+    is, and of how much.
+    """
+    tell = report or (lambda what, done, of: None)
+    log = load(path, run=run, gains=gains, part=part, report=lambda done, of: tell("reading", done, of))
+    return judge(log, part=part, report=report)
 
 
-def judge(log: Log, trace: Trace | None = None) -> Verdict:
+def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, report: Report | None = None) -> Verdict:
     """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
     central = Central.of(log.gains)
-    tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names, trace)
+    tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names, trace, part)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
-        audit = _compare(log, central, tally)
+        audit = _compare(log, central, tally, report or (lambda what, done, of: None))
     return _verdict(log, tally, audit)
 
 
 class Tally:
     """The worst gap of each proof, and the first divergence: by step, then in the order of the checks."""
 
-    def __init__(self, tolerance: float, node_names: tuple[str, ...], trace: Trace | None = None) -> None:
-        self.tolerance, self.trace, self._names = tolerance, trace, node_names
+    def __init__(
+        self, tolerance: float, node_names: tuple[str, ...], trace: Trace | None = None, part: Part | None = None
+    ) -> None:
+        self.tolerance, self.trace, self._names, self.part = tolerance, trace, node_names, part or Part()
         self.compared = dict.fromkeys((1, 2, 3), 0)
         self.gaps = dict.fromkeys((1, 2, 3), 0.0)
         self.worst: Divergence | None = None
         self.first: Divergence | None = None
+        self.later: Counter[str] = Counter()  # numbers and names beyond the tolerance, by kind, with the first
 
     def add(self, checks: Iterable[Check]) -> None:
-        for check in checks:
+        for check in map(self._in_part, checks):
             known = ~np.isnan(check.gap)
             if not known.any():
                 continue
@@ -106,11 +125,26 @@ class Tally:
             self.gaps[check.proof] = max(self.gaps[check.proof], float(gap.max()))
             if self.worst is None or gap.max() > self.worst.gap:
                 self.worst = self._divergence(check, int(gap.argmax()))
+            self.later[kind_of(check.field, check.proof)] += int((gap > self.tolerance).sum())
             beyond = np.flatnonzero((gap > self.tolerance).any(axis=1))
             if len(beyond) and (self.first is None or check.first + beyond[0] < self.first.step):
                 row = int(beyond[0])
                 column = int(np.argmax(gap[row] > self.tolerance))
                 self.first = self._divergence(check, row * gap.shape[1] + column)
+
+    def beside_the_first(self) -> dict[str, int]:
+        """How many diverge beside the first, by kind."""
+        return dict(self.later - Counter([self.first.kind] if self.first else []))
+
+    def _in_part(self, check: Check) -> Check:
+        """Without what is not to be judged."""
+        if self.part == Part():
+            return check
+        steps = check.first + np.arange(len(check.gap))
+        judged = ((steps >= self.part.first) & (steps <= self.part.last))[:, None]
+        if self.part.node is not None:
+            judged = judged & (check.owner == self._names.index(self.part.node))
+        return check._replace(gap=np.where(judged, check.gap, np.nan))
 
     def _divergence(self, check: Check, place: int) -> Divergence:
         row, column = divmod(place, check.gap.shape[1])
@@ -132,19 +166,19 @@ class Tally:
 class PathAudit:
     """Proof 5, gathered block by block. `nw`: numbers in w; one alone makes the bound an equality at step 1."""
 
-    def __init__(self, nw: int) -> None:
-        self._nw = nw
+    def __init__(self, nw: int, part: Part) -> None:
+        self._nw, self._part = nw, part
         self.holds, self.compared = True, 0
         self.margin, self.step = np.inf, -1  # the smallest, and where
         self.is_equality_at_1 = False  # so that step 1 says nothing, and is not in the margin
 
     def add(self, path: free_run.Path, tolerance: float) -> None:
-        known = ~np.isnan(path.error) & ~np.isnan(path.bound)
+        steps = path.first + np.arange(len(path.error))
+        known = ~np.isnan(path.error) & ~np.isnan(path.bound) & (steps >= self._part.first) & (steps <= self._part.last)
         allowed = path.bound + tolerance * path.rounding
         within = path.error <= allowed
         self.compared += int(known.sum())
         self.holds &= bool(within[known].all())
-        steps = path.first + np.arange(len(path.error))
         counts = known & (path.bound > 0.0)
         trivial = counts & within & (steps == 1) & (self._nw == 1)
         self.is_equality_at_1 |= bool(trivial.any())
@@ -162,26 +196,28 @@ class PathAudit:
         return smallest if self.step >= 0 else "nothing disturbed the run"
 
 
-def _compare(log: Log, central: Central, tally: Tally) -> tuple[PathAudit, float] | None:
+def _compare(log: Log, central: Central, tally: Tally, report: Report) -> tuple[PathAudit, float] | None:
     """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
     drawn = draw(log, central)
-    inputs, eta = logged_inputs(log, central, drawn), logged_states(log, central)
+    inputs = logged_inputs(log, central, drawn)
     hears = proofs.to_be_heard(log, central, drawn)
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
         now = slice(first, min(first + _STEPS_AT_ONCE, log.steps))
         tally.add(proofs.input_checks(log, central, drawn, now))
-        tally.add(proofs.step_checks(log, central, inputs, eta, now))
+        tally.add(proofs.step_checks(log, central, inputs, now))
         tally.add(proofs.message_checks(log, central, hears, now))
+        report("comparing, first pass", now.stop, log.steps)
     whole = free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
     if tally.trace is not None and log.has_plant:
         tally.trace.energy_before[:] = energy_before
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
-    audit, errors = PathAudit(log.gains.problem.nw), log.error_norms()
+    audit, errors = PathAudit(log.gains.problem.nw, tally.part), log.error_norms()
     for part in free_run.free_run(log, central, whole, block=block):
         tally.add([free_run.free_check(log, central, part)])
+        report("comparing, second pass", part.first + len(part.eta), log.steps)
         if log.has_plant:
             path = free_run.path_block(central, part, errors, energy_before)
             audit.add(path, tally.tolerance)
@@ -201,7 +237,8 @@ def _peak(log: Log) -> Peak | None:
 def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> Verdict:
     end = log.end or {}
     return Verdict(
-        recording=str(log.path),
+        recording=log.label,
+        part=tally.part,
         run=log.run.get("run", ""),
         seed=log.seed,
         steps=log.steps,
@@ -210,7 +247,10 @@ def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> V
         status=end.get("status", "cut"),
         reason=end.get("reason", ""),
         damage=log.damage,
+        is_doubtful=log.is_doubtful,
+        notes=log.notes,
         finished=log.finished,
+        whole=log.is_whole,
         is_simulated=log.is_simulated,
         external=tuple(name for name, real in zip(log.gains.problem.node_names, log.external, strict=True) if real),
         proofs=tuple(_proofs(log, tally, audit[0] if audit else None)),
@@ -218,7 +258,11 @@ def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> V
         worst=tally.worst,
         tolerance=tally.tolerance,
         first_divergence=tally.first,
+        later=tally.beside_the_first(),
         missing=log.census.missing,
+        lacking=log.census.lacking,
+        gaps=log.census.gaps,
+        copies=log.census.copies,
         duplicates=log.census.duplicates,
         strange=log.census.strange,
         numbering=log.census.numbering,
@@ -234,7 +278,9 @@ def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
         compared = tally.compared[number]
         yield Proof(number, gap <= tally.tolerance if compared else None, compared, gap)
     yield _census_proof(log)
-    if audit is not None:
+    if audit is not None and tally.part.node is not None:
+        yield Proof(5, None, 0, 0.0, "it is about all nodes together")
+    elif audit is not None:
         yield Proof(5, audit.holds if audit.compared else None, audit.compared, 0.0, audit.note())
     elif log.is_simulated:
         yield Proof(5, None, 0, 0.0, "it does not apply to measurements that are not of the simulated plant")
@@ -243,11 +289,12 @@ def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
 
 
 def _census_proof(log: Log) -> Proof:
-    """A cut file must lack something: that is held against it no more than it shows anything."""
-    missing, duplicates = log.census.missing, log.census.duplicates
-    faulty = bool(duplicates.total or log.census.strange or log.census.numbering)
-    if log.finished or faulty:
-        note = f"{missing.total} missing, {duplicates.total} double"
-        return Proof(4, not faulty and not missing.total, log.messages, 0.0, note)
-    note = f"{missing.total} lacking from step {missing.first[0].step} on" if missing.total else "none double"
-    return Proof(4, None, log.messages, 0.0, note)
+    """What a filtered or cut file lacks is held against it no more than it shows anything."""
+    census = log.census
+    faulty = bool(census.missing.total or census.duplicates.total or census.strange or census.numbering)
+    counts = [f"{census.missing.total} missing", f"{census.duplicates.total} double"]
+    if census.lacking.total:
+        steps = f" from step {census.lacking.first[0].step} on" if census.lacking.first else ""
+        counts.append(f"{census.lacking.total} not in this file{steps}")
+    holds = False if faulty else True if log.is_whole else None
+    return Proof(4, holds, log.messages, 0.0, ", ".join(counts))

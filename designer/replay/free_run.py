@@ -123,13 +123,19 @@ def path_block(central: Central, block: FreeBlock, errors: Array, energy_before:
 
 
 def _magnitudes(log: Log, central: Central, inputs: Inputs, x: Array, eta: Array, first: int) -> Array:
-    """m_k of `free_run` for one block, from the log, and from the free run where the log has holes."""
+    """m_k of `free_run` for one block, from the log, and from the free run where the log has holes.
+
+    A measurement that `complete` made of the innovation is off by what those sums round, which is within twice their
+    absolute values.
+    """
     p, steps = central.model.plant_states, slice(first, first + len(eta))
     x_hat = np.where(np.isnan(log.x_hat[steps]), np.tile(x, central.problem.n) - eta[:, p:], log.x_hat[steps])
+    made = 2.0 * (np.abs(inputs.u[steps]) + np.abs(x_hat) @ np.abs(central.C_nu).T)
+    y = np.where(np.isnan(log.measured[steps][:, central.y_owner]), made, log.y[steps])
     magnitude = np.empty_like(eta)
     for s in np.unique(inputs.mode[steps]):
         at = inputs.mode[steps] == s
-        magnitude[at] = central.magnitude(int(s), x[at], x_hat[at], inputs.w[steps][at], log.y[steps][at])
+        magnitude[at] = central.magnitude(int(s), x[at], x_hat[at], inputs.w[steps][at], y[at])
     return magnitude
 
 

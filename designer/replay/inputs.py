@@ -42,19 +42,19 @@ def draw(log: Log, central: Central) -> Drawn:
     problem, steps = log.gains.problem, log.steps
     losses = schedule.Losses(problem, seed=log.seed)
     disturbance = schedule.DisturbanceSource(problem, seed=log.seed, worst_case=log.gains.worst_case)
-    return Drawn(
-        np.fromiter(islice(schedule.modes(problem, seed=log.seed), steps), dtype=np.int64, count=steps),
-        np.array([losses.at(k) for k in range(steps)]).reshape(steps, problem.n),
-        np.array([disturbance.at(k) for k in range(steps)]).reshape(steps, problem.nw),
-        _drawn_deliveries(log, central),
-    )
+    theta, w = np.empty((steps, problem.n)), np.empty((steps, problem.nw))
+    for k in range(steps):
+        theta[k], w[k] = losses.at(k), disturbance.at(k)
+    mode = np.fromiter(islice(schedule.modes(problem, seed=log.seed), steps), dtype=np.int64, count=steps)
+    return Drawn(mode, theta, w, _drawn_deliveries(log, central))
 
 
 def _drawn_deliveries(log: Log, central: Central) -> Flags:
     drawn = np.empty((log.steps, len(central.links[0])), dtype=bool)
     if drawn.size:
         deliveries = schedule.Deliveries(log.gains.problem, seed=log.seed)
-        drawn[:] = [deliveries.at(k)[central.links] for k in range(log.steps)]
+        for k in range(log.steps):
+            drawn[k] = deliveries.at(k)[central.links]
     return drawn
 
 
@@ -84,8 +84,8 @@ def logged_plant(log: Log) -> Array:
     return log.x if log.has_plant else np.zeros_like(log.x)
 
 
-def logged_states(log: Log, central: Central) -> Array:
-    """eta(k) as logged, (steps, n_eta): [x; e_1; ...; e_n], or the errors alone where x drops out."""
-    x = logged_plant(log)
-    errors = np.tile(x, log.gains.problem.n) - log.x_hat
+def logged_states(log: Log, central: Central, now: slice) -> Array:
+    """eta(k) as logged at some steps, (steps, n_eta): [x; e_1; ...; e_n], or the errors alone where x drops out."""
+    x = logged_plant(log)[now]
+    errors = np.tile(x, log.gains.problem.n) - log.x_hat[now]
     return np.hstack([x, errors]) if central.model.plant_states else errors

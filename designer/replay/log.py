@@ -5,8 +5,9 @@ Messages are matched by (topic, step), never by their place in the file.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,19 @@ import numpy as np
 from pydantic import ValidationError
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError
+from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
-from agent.contract.keys import EVENT, MODE, PLANT_STATE, estimate, measurement
+from agent.contract.keys import COORDINATOR, EVENT, PLANT, PLANT_STATE, measurement
 from agent.contract.messages import Event
 from agent.contract.recording import Logged
-from agent.contract.recording.reader import RecordingReader
-from designer.replay.census import Census, take_census
-from designer.replay.topics import Numbers, Senders, Topic, Words, topics_of
+from agent.contract.recording.reader import Progress, RecordingReader
+from designer.replay.census import Census, Facts, take_census
+from designer.replay.part import Part
+from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
+
+EVIDENCE = "evidence"  # the recorder's own topic: what senders say of their messages
+_NAMED = 3  # so many damages and topics are named
+_LARGEST = 1 << 33  # bytes of the arrays that hardly any message fills
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +36,12 @@ class Log:
     """What a recording says. Vectors of the nodes stand side by side, nodes in file order."""
 
     path: Path
+    label: str  # what to call it: its path, or those of its parts
     run: dict[str, str]  # the metadata of its beginning
     end: dict[str, str] | None  # and of its end; None where the file was cut
     damage: str  # what is wrong with the file, "" where nothing is
+    is_doubtful: bool  # its checksum fails, so that any number in it may be a wrong one
+    notes: tuple[str, ...]  # what is odd about the file, and harms nothing
     finished: bool  # the run came to its planned end, and the file is sound
     gains: Gains
     seed: int
@@ -66,104 +75,230 @@ class Log:
         """A simulated plant gave every measurement and was recorded, so that errors can be computed."""
         return not any(self.external) and self.is_simulated
 
+    @property
+    def is_whole(self) -> bool:
+        """The run is finished, and every message of it is there."""
+        return self.finished and not self.census.missing.total and not self.census.lacking.total
+
     def error_norms(self) -> Array:
         """|z_tilde(k)| over all nodes, as logged, (steps,); NaN where a message is missing."""
-        return np.asarray(np.linalg.norm(np.tile(self.z, self.gains.problem.n) - self.z_hat, axis=1))
+        n, nz = self.gains.problem.n, self.gains.problem.nz
+        squares = ((self.z - self.z_hat[:, i * nz : (i + 1) * nz]) ** 2 for i in range(n))
+        return np.asarray(np.sqrt(sum(of_node.sum(axis=1) for of_node in squares)))
 
 
-def load(path: Path) -> Log:
-    """Read a recording, whole or cut. Raises InputError for a file that is none."""
-    with RecordingReader(path) as reader:
-        problem = reader.gains.problem
-        seed, planned = _integer(reader.run, "seed", path=path), _integer(reader.run, "steps", path=path)
+def load(
+    path: Path | Sequence[Path],
+    *,
+    run: str | None = None,
+    gains: Path | None = None,
+    part: Part | None = None,
+    report: Progress | None = None,
+) -> Log:
+    """Read a recording, whole or cut, or the files that hold parts of one. Raises InputError for what is none.
+
+    `run` chooses among several runs, `gains` is the gains file where the recording lost its own, `part` is what alone
+    will be judged, `report` is told the bytes read so far, and of how many.
+    """
+    paths = [path] if isinstance(path, Path) else list(path)
+    with RecordingReader(*paths, run=run, gains=gains) as reader:
+        seed, planned = _integer(reader.run, "seed", path=paths[0]), _integer(reader.run, "steps", path=paths[0])
         external = _external(reader)
-        topics, content = topics_of(problem, external), _Content(reader.gains, planned)
-        content.read(reader.messages(), topics)
-        end, damage = reader.end or {}, reader.damage
-    if reader.run.get("gains", reader.gains.digest()) != reader.gains.digest():
-        content.strange.append("the attached gains are not those that the run was made with: their digests differ")
-    finished = end.get("status") == "finished" and not damage
-    last = max(int(topic.steps.max(initial=-1)) for topic in topics.values())
-    expected = _integer(end, "steps", path=path) if finished else last + 1
-    steps = min(last + 1, expected)
+        if part is not None and part.node is not None:
+            reader.gains.problem.node_index(part.node)  # refuses a name that does not exist
+        content = _Content(reader.gains, external, planned)
+        content.read(reader.messages(report))
+        return _log(reader, content, external, part or Part(), seed=seed, planned=planned)
+
+
+def _log(
+    reader: RecordingReader, content: _Content, external: tuple[bool, ...], part: Part, *, seed: int, planned: int
+) -> Log:
+    """The arrays, and what is wrong with what is in them."""
+    end, damages = reader.end or {}, reader.damages
+    problem, topics, columns = reader.gains.problem, content.topics, content.columns
+    unreadable = content.unreadable()
+    strange = [*content.faults(), *reader.faults]
+    if unreadable.total and (damages or reader.is_unchecked):
+        first = unreadable.first[0]
+        damages.append(f"{counted(unreadable.total, 'message')} cannot be read, the first of them on {first}")
+    else:
+        strange += unreadable.all()
+    finished = end.get("status") == "finished" and not damages
+    last = content.last()
+    expected = _integer(end, "steps", path=reader.path) if finished else last + 1
     if finished and expected != planned:
-        content.strange.append(f"the end, it says that the run finished after {expected} of {planned} steps")
-    nothing_simulated = all(external) and not len(topics[PLANT_STATE].steps)
+        strange.append(f"the end, it says that the run finished after {expected} of {planned} steps")
+    steps = min(last + 1, expected)
+    _refuse_hollow(columns, steps, content.messages, path=reader.path)
     census = take_census(
-        [topic for topic in topics.values() if not (nothing_simulated and topic.topic == PLANT_STATE)],
-        steps=expected,
-        whole=finished,
-        strange=content.strange,
-        events=content.events,
+        topics.values(),
+        columns,
+        content.facts(end, steps=expected, finished=finished, external=external),
+        strange=strange,
+        part=part,
     )
+    if census.duplicates.total and not reader.is_alone:
+        raise InputError(f"{reader.label} holds runs that went on at the same time; their messages cannot be parted")
+    columns.release("number", "time")
     return Log(
-        path=path,
+        path=reader.path,
+        label=reader.label,
         run=reader.run,
         end=reader.end,
-        damage=damage,
+        damage=_joined(damages),
+        is_doubtful=reader.is_doubtful,
+        notes=(*reader.notes, *_strangers(reader, content.others), *census.notes),
         finished=finished,
         gains=reader.gains,
         seed=seed,
         planned=planned,
         steps=steps,
-        messages=content.messages,
+        messages=content.messages - census.copies,
         census=census,
         external=external,
         modes=content.modes,
         senders=content.senders,
-        **_columns(topics, problem.node_names, steps),
+        **_arrays(columns, topics, problem.node_names, steps),
     )
 
 
-def _columns(topics: dict[str, Topic], names: tuple[str, ...], steps: int) -> dict[str, Any]:
-    """The arrays of a Log."""
-    state, estimates = topics[PLANT_STATE], [topics[estimate(name)] for name in names]
+def _arrays(columns: Columns, topics: dict[str, Topic], names: tuple[str, ...], steps: int) -> dict[str, Any]:
+    """The arrays of a Log: the columns as far as the run goes, with NaN or -1 for what is not there."""
+    columns.reach(steps)
+    has = columns["has"][:steps]
+    measured = np.empty((steps, len(names)))
+    for i, name in enumerate(names):
+        topic = topics[measurement(name)]
+        there, first = has[:, topic.place], columns["y"][:steps, topic.places["y"].start]
+        measured[:, i] = np.where(there, np.isfinite(first), np.nan)
+    for topic in topics.values():
+        absent = ~has[:, topic.place]
+        if absent.any():
+            for name, at in topic.places.items():
+                columns[name][:steps][absent, at] = np.nan
+            for name, column in topic.words.items():
+                columns[name][:steps][absent, column] = -1
+    fields = {name: columns[name][:steps] for name in ("x", "z", "w", "y", "innovation", "x_hat", "z_hat")}
+    words = {name: columns[name][:steps] for name in ("used", "heard")}
     return {
-        "mode": topics[MODE].words("mode", steps),
-        "x": state.column("x", steps),
-        "z": state.column("z", steps),
-        "w": state.column("w", steps),
-        "theta": state.column("arrived", steps),
-        "y": np.hstack([topics[measurement(name)].column("y", steps) for name in names]),
-        "measured": np.column_stack([topics[measurement(name)].filled("y", steps) for name in names]),
-        "innovation": np.hstack([topic.column("innovation", steps) for topic in estimates]),
-        "x_hat": np.hstack([topic.column("x_hat", steps) for topic in estimates]),
-        "z_hat": np.hstack([topic.column("z_hat", steps) for topic in estimates]),
-        "used": np.column_stack([topic.words("mode", steps) for topic in estimates]),
-        "heard": np.column_stack([topic.words("heard", steps) for topic in estimates]),
+        **fields,
+        **words,
+        "mode": columns["mode"][:steps, 0],
+        "theta": columns["arrived"][:steps],
+        "measured": measured,
     }
 
 
 class _Content:
     """What is gathered while the messages stream by."""
 
-    def __init__(self, gains: Gains, planned: int) -> None:
+    def __init__(self, gains: Gains, external: tuple[bool, ...], planned: int) -> None:
         self.modes, self.senders = Words(gains.problem.mode_names), Senders(gains.problem.node_names)
+        self.topics, self.columns = topics_of(gains.problem, external, planned=planned)
         self.messages = 0
-        self.strange: list[str] = []
-        self.events: Counter[int] = Counter()
         self._planned = planned
+        self._unreadable = Sentences()
+        self.others: Counter[str] = Counter()  # topics that this problem does not have
+        self._events, self._keys = array("q"), array("q")  # numbers of events, and what tells one from another
+        self._kinds: set[str] = set()  # of the coordinator's events
 
-    def read(self, messages: Iterator[Logged], topics: dict[str, Topic]) -> None:
+    def read(self, messages: Iterable[Logged]) -> None:
+        topics, columns, planned, modes, senders = self.topics, self.columns, self._planned, self.modes, self.senders
         for logged in messages:
-            self.messages += 1
             topic = topics.get(logged.topic)
             if topic is not None:
-                fault = topic.add(logged, planned=self._planned, modes=self.modes, senders=self.senders)
-            else:
-                fault = self._event(logged)
-            if fault:
-                self.strange.append(f"{logged.topic}, {fault}")
+                self.messages += 1
+                topic.add(logged, columns, planned=planned, modes=modes, senders=senders)
+            elif logged.topic == EVENT:
+                self.messages += 1
+                self._event(logged)
+            elif logged.topic != EVIDENCE:
+                self.others[logged.topic] += 1
+        for topic in topics.values():
+            topic.settle(columns)
 
-    def _event(self, logged: Logged) -> str:
-        if logged.topic != EVENT:
-            return f"number {logged.number}: this problem has no such topic"
+    def _event(self, logged: Logged) -> None:
         try:
-            Event.decode(logged.payload)
+            event = Event.decode(logged.payload)
         except ValidationError as error:
-            return f"number {logged.number}: {error.errors(include_url=False)[0]['msg'].lower()}"
-        self.events[logged.number] += 1
-        return ""
+            words = error.errors(include_url=False)[0]["msg"].lower()
+            self._unreadable.add(f"{EVENT}, number {logged.number}: {words}")
+            return
+        if event.who == COORDINATOR:
+            self._kinds.add(event.kind)
+        self._events.append(logged.number)
+        self._keys.append(hash((logged.publish_time, logged.payload)))
+
+    def last(self) -> int:
+        """The last step of which there is anything, -1 where there is nothing."""
+        return max(topic.last for topic in self.topics.values())
+
+    def faults(self) -> list[str]:
+        """Messages that can be read, and cannot be of this run."""
+        return [fault for topic in self.topics.values() for fault in topic.faults.all()]
+
+    def unreadable(self) -> Sentences:
+        """Messages that are none."""
+        found = Sentences()
+        for some in (self._unreadable, *(topic.unreadable for topic in self.topics.values())):
+            found.total += some.total
+            found.first += some.first
+        return found
+
+    def facts(self, end: dict[str, str], *, steps: int, finished: bool, external: tuple[bool, ...]) -> Facts:
+        """What the census must know beside the messages."""
+        _, first = np.unique(np.array(self._keys, dtype=np.int64), return_index=True)
+        recorded = {
+            key.removeprefix("received."): int(count)
+            for key, count in end.items()
+            if key.startswith("received.") and count.isdigit()
+        }
+        without_plant = all(external) and self.topics[PLANT_STATE].last < 0 and not recorded.get(PLANT)
+        return Facts(
+            steps=steps,
+            is_finished=finished,
+            has_start="start" in self._kinds,
+            has_end="end" in self._kinds,
+            events=np.array(self._events, dtype=np.int64)[first],
+            event_copies=len(self._events) - len(first),
+            recorded=recorded,
+            unplanned=frozenset({PLANT_STATE} if without_plant else ()),
+        )
+
+
+def _strangers(reader: RecordingReader, others: Counter[str]) -> list[str]:
+    """Lines for what is in the file and not of the run."""
+    lines = []
+    topics = reader.foreign + others
+    if topics:
+        names = _some(sorted(topics))
+        of = counted(len(topics), "topic")
+        be = "is" if topics.total() == 1 else "are"
+        lines.append(f"{counted(topics.total(), 'message')} on {of} {be} not of this run, and {be} left alone: {names}")
+    if reader.others:
+        lines.append(f"{counted(reader.others, 'message')} of other runs are left alone")
+    if reader.strangers:
+        lines.append(f"metadata and attachments of others are left alone: {_some(reader.strangers)}")
+    return lines
+
+
+def _some(names: list[str]) -> str:
+    """The first of them, and whether there are more."""
+    return ", ".join([*names[: 2 * _NAMED], *(["..."] if len(names) > 2 * _NAMED else [])])
+
+
+def _refuse_hollow(columns: Columns, steps: int, messages: int, *, path: Path) -> None:
+    """InputError where the arrays would take all memory for hardly any message."""
+    size = steps * columns.width
+    if size > _LARGEST and steps > 100 * messages:
+        raise InputError(f"{path} has step {steps - 1} among only {counted(messages, 'message')}: too far to compare")
+
+
+def _joined(sentences: list[str]) -> str:
+    """As one text; of many the first, and how many more."""
+    more = len(sentences) - _NAMED
+    return "; ".join([*sentences[:_NAMED], *([f"{more} more damages"] if more > 0 else [])])
 
 
 def _external(reader: RecordingReader) -> tuple[bool, ...]:
@@ -176,6 +311,6 @@ def _external(reader: RecordingReader) -> tuple[bool, ...]:
 
 def _integer(metadata: dict[str, str], key: str, *, path: Path) -> int:
     text = metadata.get(key, "")
-    if not (text.isascii() and text.isdigit()):
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
         raise InputError(f'{path}: its metadata gives "{text}" for {key}; it must be a number 0, 1, 2, ...')
     return int(text)

@@ -13,7 +13,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from designer.model.error_model import measurement_slices
 from designer.replay.central import FLOOR, Central, Flags
-from designer.replay.inputs import Drawn, Inputs, logged_plant
+from designer.replay.inputs import Drawn, Inputs, logged_plant, logged_states
 from designer.replay.log import Log
 from designer.replay.topics import Numbers
 
@@ -143,16 +143,17 @@ def to_be_heard(log: Log, central: Central, drawn: Drawn) -> Numbers:
     return heard
 
 
-def step_checks(log: Log, central: Central, inputs: Inputs, eta: Array, now: slice) -> Iterator[Check]:
+def step_checks(log: Log, central: Central, inputs: Inputs, now: slice) -> Iterator[Check]:
     """Proof 2: eq. (10) from the logged eta(k) gives the logged e(k+1); shown as x_hat(k+1) = x(k+1) - e(k+1)."""
     problem, model, nx = central.problem, central.model, central.problem.nx
     p, x = model.plant_states, logged_plant(log)
     now = slice(now.start, min(now.stop, log.steps - 1))  # the last step has no successor
     mode, w, u = inputs.mode[now], inputs.w[now], inputs.u[now]
-    predicted, magnitude = np.full_like(eta[now], np.nan), np.ones_like(eta[now])
+    eta = logged_states(log, central, now)
+    predicted, magnitude = np.full_like(eta, np.nan), np.ones_like(eta)
     for s in range(len(problem.topologies)):
         at = np.flatnonzero(mode == s)
-        state, d_theta = eta[now][at], inputs.theta[now][at] - model.beta
+        state, d_theta = eta[at], inputs.theta[now][at] - model.beta
         unknown = np.isnan(state)
         state = np.where(unknown, 0.0, state)
         eta_next = state @ model.A[s].T + w[at] @ model.B[s].T

@@ -1,16 +1,19 @@
-"""The topics of one run, column by column, as their messages come out of a recording."""
+"""The topics of one run, column by column, as their messages come out of a recording.
+
+A run may have millions of messages: their numbers go into columns with a row for each step, and nothing else is kept.
+"""
 
 from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from agent.contract.arrays import Array
 from agent.contract.keys import COORDINATOR, MODE, PLANT, PLANT_STATE, estimate, measurement, node_who
 from agent.contract.messages import Estimate, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
@@ -19,6 +22,10 @@ from agent.contract.recording import Logged
 Numbers = NDArray[np.int64]
 
 CEILING = 1e140  # squares of larger numbers overflow in the proofs
+NAMED = 20  # so many faults of a kind are named, the others counted
+_ROWS = 1 << 20  # of the columns at first, where the run has so many steps
+_STAMP = ("number", "time")  # columns that are not of a message's content
+_AT_ONCE = 512  # messages of a topic that wait to be entered together
 
 
 class Words:
@@ -61,101 +68,210 @@ class Senders:
         return np.array(rows, dtype=bool).reshape(len(rows), len(self._node_names))
 
 
-class Topic:
-    """The messages of one topic in the order of the file.
+class Sentences:
+    """The first of many sentences, and how many there were."""
 
-    Where two of them claim the same step the one with the lowest number counts: the order of the file decides
-    nothing. `who` numbers the messages; None for a sensor driver, which need not number them. Vectors may be empty
-    where the problem allows it, `may_be_empty`.
+    def __init__(self) -> None:
+        self.total, self.first = 0, list[str]()
+
+    def add(self, sentence: str) -> None:
+        self.total += 1
+        if self.total <= NAMED:
+            self.first.append(sentence)
+
+    def all(self) -> list[str]:
+        more = self.total - len(self.first)
+        return [*self.first, *([f"... {more} more like the last"] if more else [])]
+
+
+class Columns:
+    """Arrays with a row for each step; rows that nothing was written to take no memory."""
+
+    def __init__(self, widths: dict[str, tuple[int, type]], *, planned: int) -> None:
+        self._widths, self._planned, self.rows = widths, planned, min(planned, _ROWS)
+        self._arrays = {name: self._made(name, self.rows) for name in widths}
+
+    def _made(self, name: str, rows: int) -> NDArray[Any]:
+        width, kind = self._widths[name]
+        return (np.zeros if kind is np.bool_ else np.empty)((rows, width), dtype=kind)
+
+    def reach(self, rows: int) -> None:
+        """Make room for so many rows, of those that are planned."""
+        if rows <= self.rows:
+            return
+        self.rows = min(self._planned, max(2 * self.rows, rows))
+        for name, old in list(self._arrays.items()):
+            self._arrays[name] = self._made(name, self.rows)
+            self._arrays[name][: len(old)] = old
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._arrays[name]
+
+    @property
+    def width(self) -> int:
+        """Bytes of a row."""
+        return sum(array.itemsize * array.shape[1] for array in self._arrays.values())
+
+    def release(self, *names: str) -> None:
+        """Forget columns."""
+        for name in names:
+            del self._arrays[name]
+
+
+class Topic:
+    """The messages of one topic: their step, their number and time, and where their numbers stand in the columns.
+
+    Equal messages of a step are one. Where different ones claim the same step the one with the lowest number counts:
+    the order of the file decides nothing. `who` numbers the messages; None for a sensor driver, which need not number
+    them. Vectors may be empty where the problem allows it, `may_be_empty`.
     """
 
     def __init__(
-        self, topic: str, model: type[Message], widths: dict[str, int], *, who: str | None, may_be_empty: bool = False
+        self,
+        topic: str,
+        model: type[Message],
+        places: dict[str, slice],
+        words: dict[str, int],
+        *,
+        place: int,
+        who: str | None,
+        may_be_empty: bool = False,
     ) -> None:
-        self.topic, self.who = topic, who
-        self._model, self._widths, self._may_be_empty = model, widths, may_be_empty
-        self._steps, self._numbers = array("q"), array("q")
-        self._values = {name: array("d") for name in widths}
-        self._words: dict[str, array[int]] = {"mode": array("q"), "heard": array("q")}
+        """`places` are the columns of its vectors, `words` those of its texts, `place` that of the topic itself."""
+        self.topic, self.who, self.place = topic, who, place
+        self.last = -1  # step
+        self.copies = 0  # messages that stand there again, equal in content
+        self.double: set[int] = set()  # steps of which there is another message, of other content
+        self.faults = Sentences()  # messages that cannot be of this run
+        self.unreadable = Sentences()  # messages that are none at all
+        self._model, self.places, self._may_be_empty = model, places, may_be_empty
+        self._widths = {name: at.stop - at.start for name, at in places.items()}
+        self.words = words
+        self._clear()
 
-    def add(self, logged: Logged, *, planned: int, modes: Words, senders: Senders) -> str:
-        """Take in a message; returns what keeps it from being one of this run, "" where nothing does."""
+    def _clear(self) -> None:
+        self._steps, self._numbers, self._times = array("q"), array("q"), array("q")
+        self._values = {name: array("d") for name in self.places}
+        self._texts = {name: array("q") for name in self.words}
+
+    def add(self, logged: Logged, columns: Columns, *, planned: int, modes: Words, senders: Senders) -> None:
+        """Take in a message."""
         try:
             message = self._model.decode(logged.payload)
         except ValidationError as error:
-            return f"number {logged.number}: {error.errors(include_url=False)[0]['msg'].lower()}"
-        fault = self._fault(message)
-        if not fault and message.step >= planned:
-            fault = f"the run has only {planned} steps"
+            words = error.errors(include_url=False)[0]["msg"].lower()
+            self.unreadable.add(f"{self.topic}, number {logged.number}: {words}")
+            return
+        fault = self._fault(message, planned)
         if fault:
-            return f"step {message.step}: {fault}"
+            self.faults.add(f"{self.topic}, step {message.step}: {fault}")
+            return
         self._steps.append(message.step)
         self._numbers.append(logged.number)
+        self._times.append(logged.log_time)
         for name, values in self._values.items():
             values.extend(getattr(message, name) or [math.nan] * self._widths[name])
-        if isinstance(message, Mode | Estimate):
-            self._words["mode"].append(modes.number(message.mode))
-        if isinstance(message, Estimate):
-            self._words["heard"].append(senders.number(message.heard))
-        return ""
+        if isinstance(message, Mode):
+            self._texts["mode"].append(modes.number(message.mode))
+        elif isinstance(message, Estimate):
+            self._texts["used"].append(modes.number(message.mode))
+            self._texts["heard"].append(senders.number(message.heard))
+        if len(self._steps) == _AT_ONCE:
+            self.settle(columns)
 
-    def _fault(self, message: Message) -> str:
+    def _fault(self, message: Message, planned: int) -> str:
+        if message.step >= planned:
+            return f"the run has only {planned} steps"
         for name, width in self._widths.items():
             values = getattr(message, name)
             if len(values) != width and (values or not self._may_be_empty):
                 return f"{name} has {len(values)} numbers where the problem has {width}"
-            if values and max(map(abs, values)) > CEILING:
+            if values and (max(values) > CEILING or min(values) < -CEILING):
                 return f"{name} holds {max(values, key=abs)}, beyond {CEILING:g}"
         return ""
 
-    @property
-    def steps(self) -> Numbers:
-        """The step of every message, in the order of the file."""
-        return np.array(self._steps, dtype=np.int64)
+    def settle(self, columns: Columns) -> None:
+        """Enter the messages that wait."""
+        if not self._steps:
+            return
+        steps = np.array(self._steps)
+        self.last = max(self.last, int(steps.max()))
+        columns.reach(self.last + 1)
+        has = columns["has"][:, self.place]
+        fresh = ~has[steps]
+        if not (np.diff(steps) > 0).all():
+            first = np.zeros(len(steps), dtype=bool)
+            first[np.unique(steps, return_index=True)[1]] = True
+            fresh &= first
+        rows = dict(self._rows(columns))
+        for column, batch in rows.values():
+            column[steps[fresh]] = batch[fresh]
+        has[steps[fresh]] = True
+        for at in np.flatnonzero(~fresh):
+            self._again(int(at), int(steps[at]), rows)
+        self._clear()
 
-    @property
-    def numbers(self) -> Numbers:
-        """The sender's number of every message, in the order of the file."""
-        return np.array(self._numbers, dtype=np.int64)
+    def _rows(self, columns: Columns) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]]]]:
+        """The columns of this topic, and what waits to be written there."""
+        yield "number", (columns["number"][:, self.place], np.array(self._numbers))
+        yield "time", (columns["time"][:, self.place], np.array(self._times))
+        for name, at in self.places.items():
+            yield name, (columns[name][:, at], np.array(self._values[name]).reshape(-1, self._widths[name]))
+        for name, texts in self._texts.items():
+            yield name, (columns[name][:, self.words[name]], np.array(texts))
 
-    def rows(self, steps: int) -> tuple[Numbers, Numbers]:
-        """The steps below `steps` that are there, ascending, and the message that counts for each."""
-        at = self.steps
-        order = np.lexsort((self.numbers, at))
-        order = order[at[order] < steps]
-        present, first = np.unique(at[order], return_index=True)
-        return present, order[first]
-
-    def column(self, name: str, steps: int) -> Array:
-        """(steps, width), NaN where the message is missing, or the vector is empty."""
-        present, rows = self.rows(steps)
-        column = np.full((steps, self._widths[name]), np.nan)
-        column[present] = np.array(self._values[name]).reshape(-1, self._widths[name])[rows]
-        return column
-
-    def filled(self, name: str, steps: int) -> Array:
-        """(steps,): 1 where the vector has numbers, 0 where it is empty, NaN where the message is missing."""
-        filled = np.full(steps, np.nan)
-        present, _ = self.rows(steps)
-        filled[present] = np.isfinite(self.column(name, steps)[present, 0])
-        return filled
-
-    def words(self, name: str, steps: int) -> Numbers:
-        """(steps,), -1 where the message is missing."""
-        present, rows = self.rows(steps)
-        column = np.full(steps, -1, dtype=np.int64)
-        column[present] = np.array(self._words[name], dtype=np.int64)[rows]
-        return column
+    def _again(self, at: int, step: int, rows: dict[str, tuple[NDArray[Any], NDArray[Any]]]) -> None:
+        """Another message of a step that is there."""
+        contents = [
+            (column[step], batch[at]) for name, (column, batch) in rows.items() if name not in ("number", "time")
+        ]
+        before, now = (b"".join(pair[which].tobytes() for pair in contents) for which in (0, 1))
+        if before == now:
+            self.copies += 1
+        else:
+            self.double.add(step)
+        number, batch = rows["number"]
+        if (batch[at], now) < (number[step], before):
+            for column, values in rows.values():
+                column[step] = values[at]
 
 
-def topics_of(problem: Problem, external: tuple[bool, ...]) -> dict[str, Topic]:
-    """Every topic that a run of this problem has, but events. `external`: per node, is its sensor a real one."""
-    state = {"x": problem.nx, "z": problem.nz, "w": problem.nw, "arrived": problem.n}
-    topics = [Topic(MODE, Mode, {}, who=COORDINATOR), Topic(PLANT_STATE, PlantState, state, who=PLANT)]
-    for node, is_real in zip(problem.nodes, external, strict=True):
-        ny = node.C.shape[0]
-        widths = {"x_hat": problem.nx, "innovation": ny, "z_hat": problem.nz}
-        topics.append(Topic(estimate(node.name), Estimate, widths, who=node_who(node.name)))
-        who = None if is_real else PLANT
-        topics.append(Topic(measurement(node.name), Measurement, {"y": ny}, who=who, may_be_empty=node.seen))
-    return {topic.topic: topic for topic in topics}
+def topics_of(problem: Problem, external: tuple[bool, ...], *, planned: int) -> tuple[dict[str, Topic], Columns]:
+    """Every topic that a run of this problem has, but events, and the columns that they fill.
+
+    `external`: per node, is its sensor a real one. `planned`: steps of the run.
+    """
+    n, nx, nz = problem.n, problem.nx, problem.nz
+    state = {"x": slice(0, nx), "z": slice(0, nz), "w": slice(0, problem.nw), "arrived": slice(0, n)}
+    topics = [Topic(MODE, Mode, {}, {"mode": 0}, place=0, who=COORDINATOR)]
+    topics.append(Topic(PLANT_STATE, PlantState, state, {}, place=1, who=PLANT))
+    ends = np.cumsum([len(node.C) for node in problem.nodes])
+    for i, (node, is_real, end) in enumerate(zip(problem.nodes, external, ends.tolist(), strict=True)):
+        y = slice(end - len(node.C), end)
+        vectors = {"x_hat": slice(i * nx, (i + 1) * nx), "innovation": y, "z_hat": slice(i * nz, (i + 1) * nz)}
+        words, who = {"used": i, "heard": i}, node_who(node.name)
+        topics.append(Topic(estimate(node.name), Estimate, vectors, words, place=2 + 2 * i, who=who))
+        sensor = None if is_real else PLANT
+        topics.append(
+            Topic(
+                measurement(node.name), Measurement, {"y": y}, {}, place=3 + 2 * i, who=sensor, may_be_empty=node.seen
+            )
+        )
+    ny, each = int(ends[-1]), len(topics)
+    widths: dict[str, tuple[int, type]] = {
+        "has": (each, np.bool_),
+        "number": (each, np.uint32),
+        "time": (each, np.int64),
+        "mode": (1, np.int64),
+        "used": (n, np.int64),
+        "heard": (n, np.int64),
+        "x": (nx, np.float64),
+        "z": (nz, np.float64),
+        "w": (problem.nw, np.float64),
+        "arrived": (n, np.float64),
+        "y": (ny, np.float64),
+        "innovation": (ny, np.float64),
+        "x_hat": (n * nx, np.float64),
+        "z_hat": (n * nz, np.float64),
+    }
+    return {topic.topic: topic for topic in topics}, Columns(widths, planned=planned)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO
+from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
 from designer.replay.census import Faults
 from designer.replay.gamma import Gamma
+from designer.replay.part import Part
 
 CLAIMS = {  # what each proof shows, and what is counted
     1: (
@@ -19,6 +22,20 @@ CLAIMS = {  # what each proof shows, and what is counted
     4: ("every message is there once", "messages"),
     5: ("path inequality |z~(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2", "steps"),
 }
+
+
+OUTCOMES = {  # of every replay one; what it is called in the first line, and its exit code
+    "agrees": ("agrees", EXIT_GOOD),
+    "agrees for what is there": ("agrees for what is there, but is not whole", EXIT_BROKEN),
+    "diverges": ("DIVERGES", EXIT_NO),
+    "unreadable": ("nothing can be said", EXIT_BROKEN),
+}
+_KINDS = {2: "in one step of the model", 3: "in the free run"}  # divergences of these proofs, beside a field
+
+
+def kind_of(field: str, proof: int) -> str:
+    """The kind of a divergence: what the field is called, and where that is not all, what it was compared with."""
+    return f"{field.partition('[')[0]} {_KINDS.get(proof, '')}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -40,9 +57,29 @@ class Divergence:
             whose = "of the coordinator"
         return f"{self.field} {whose}"
 
+    @property
+    def kind(self) -> str:
+        return kind_of(self.field, self.proof)
+
+    @property
+    def ulps(self) -> int | None:
+        """The distance of the two numbers in units in the last place, counted in float64; None of names."""
+        if isinstance(self.logged, str) or isinstance(self.expected, str):
+            return None
+        return abs(_ordinal(self.logged) - _ordinal(self.expected))
+
     def text(self) -> str:
         values = (repr(value) if isinstance(value, float) else f'"{value}"' for value in (self.logged, self.expected))
         return "step {}: {} is {}, expected {}".format(self.step, self.place, *values)
+
+    def document(self) -> dict[str, Any]:
+        return {**vars(self), "ulps": self.ulps}
+
+
+def _ordinal(value: float) -> int:
+    """Its place among all float64."""
+    bits = int.from_bytes(struct.pack(">d", value), "big", signed=True)
+    return bits if bits >= 0 else -(bits & (2**63 - 1))
 
 
 @dataclass(frozen=True)
@@ -59,7 +96,7 @@ class Proof:
         claim, counted = CLAIMS[self.number]
         match self.holds:
             case None:
-                outcome = "cut  " if self.number == 4 else "  -  "
+                outcome = "part " if self.number == 4 else "  -  "
             case _:
                 outcome = "holds" if self.holds else "FAILS"
         details = [f"{self.compared} {counted}" + (" compared" if self.number <= 3 else "")]
@@ -82,6 +119,7 @@ class Verdict:
     """A replay's verdict. Gaps and the tolerance are relative to the magnitudes that enter each number."""
 
     recording: str
+    part: Part  # what alone was judged
     run: str
     seed: int
     steps: int  # that the file holds
@@ -90,7 +128,10 @@ class Verdict:
     status: str  # what the run said of its end; "cut" where it said nothing
     reason: str
     damage: str  # what is wrong with the file, "" where nothing is
-    finished: bool
+    is_doubtful: bool  # its checksum fails, so that any number in it may be a wrong one
+    notes: tuple[str, ...]  # what is odd about the file, and harms nothing
+    finished: bool  # the run came to its planned end, and the file is sound
+    whole: bool  # and every message of it is there
     is_simulated: bool  # a simulated plant is in the file
     external: tuple[str, ...]  # nodes with sensors of their own; where there are any, estimates are compared
     proofs: tuple[Proof, ...]
@@ -98,8 +139,12 @@ class Verdict:
     worst: Divergence | None  # where the worst gap is
     tolerance: float
     first_divergence: Divergence | None
-    missing: Faults
-    duplicates: Faults
+    later: Mapping[str, int]  # numbers and names that diverge beside the first, by kind
+    missing: Faults  # nothing explains that they are not there
+    lacking: Faults  # not in this file, as after a filter, a cut or damage
+    gaps: tuple[str, ...]  # what is lacking, in words
+    duplicates: Faults  # of different content for the same step
+    copies: int  # of equal content
     strange: tuple[str, ...]  # what should not be in the file
     numbering: tuple[str, ...]  # faults in the senders' numbering
     peak: Peak | None  # against the simulated plant, also where sensors measured something else
@@ -109,36 +154,57 @@ class Verdict:
 
     @property
     def agrees(self) -> bool:
-        """What is in the file agrees. Messages that a cut file lacks are not held against it."""
+        """What is in the file agrees. Messages that a filtered or cut file lacks are not held against it."""
         return all(proof.holds is not False for proof in self.proofs)
 
     @property
-    def exit_code(self) -> int:
+    def compared(self) -> int:
+        """Numbers and names that were compared."""
+        return sum(proof.compared for proof in self.proofs if proof.number <= 3)
+
+    @property
+    def outcome(self) -> str:
+        """One of OUTCOMES. Where a checksum fails, a number that does not agree is damage, and accuses nobody."""
         if not self.agrees:
-            return EXIT_NO
-        return EXIT_GOOD if self.finished else EXIT_BROKEN
+            return "unreadable" if self.is_doubtful else "diverges"
+        if not self.compared:
+            return "unreadable"
+        return "agrees" if self.whole else "agrees for what is there"
+
+    @property
+    def exit_code(self) -> int:
+        return OUTCOMES[self.outcome][1]
 
     def document(self) -> dict[str, Any]:
         """For --json: plain values, None where nothing can be said."""
         first = self.first_divergence
         return {
             "recording": self.recording,
+            **self.part.document(),
             "run": self.run,
             "agrees": self.agrees,
+            "outcome": self.outcome,
             "finished": self.finished,
+            "whole": self.whole,
             "status": self.status,
             "reason": self.reason,
             "damage": self.damage,
+            "notes": list(self.notes),
             "seed": self.seed,
             "steps": self.steps,
             "planned": self.planned,
             "messages": self.messages,
             "worst_gap": self.worst_gap,
-            "worst": vars(self.worst) if self.worst else None,
+            "worst": self.worst.document() if self.worst else None,
             "tolerance": self.tolerance,
-            "first_divergence": vars(first) if first else None,
+            "first_divergence": first.document() if first else None,
+            "later_divergences": dict(self.later),
             "missing": self.missing.total,
             "missing_first": [place._asdict() for place in self.missing.first],
+            "lacking": self.lacking.total,
+            "lacking_first": [place._asdict() for place in self.lacking.first],
+            "lacking_words": list(self.gaps),
+            "copies": self.copies,
             "duplicates": self.duplicates.total,
             "duplicates_first": [place._asdict() for place in self.duplicates.first],
             "strange": list(self.strange),
@@ -157,35 +223,67 @@ class Verdict:
         }
 
     def text(self) -> str:
+        if not self.compared:
+            return "\n".join(self._head())
         return "\n".join([*self._head(), *self._peak(), *self._proofs(), *self._faults()])
 
-    def _head(self) -> list[str]:
-        if not self.agrees:
-            answer = "DIVERGES"
-        else:
-            answer = "agrees" if self.finished else "agrees as far as it goes, but is not whole"
-        lines = [
-            f"{self.recording}: {answer}",
-            f'run "{self.run}", seed {self.seed}, {self.steps} of {self.planned} steps, {self.messages} messages, '
-            f"{self.status}{f': {self.reason}' if self.reason else ''}",
+    def headline(self) -> str:
+        """The outcome, and in a few words why, where that is not a number."""
+        answer = OUTCOMES[self.outcome][0]
+        if self.outcome == "unreadable":
+            return f"{answer}: " + ("it holds nothing to compare" if self.agrees else "its bytes were changed later")
+        if self.outcome == "diverges" and all(proof.holds is not False for proof in self.proofs if proof.number != 4):
+            return f"{answer}: every number in it agrees, but {self._what_is_wrong()}"
+        return answer
+
+    def _what_is_wrong(self) -> str:
+        """The faults of proof 4 in a few words."""
+        missing, double = self.missing.total, self.duplicates.total
+        found = [
+            f"{counted(missing, 'message')} {'is' if missing == 1 else 'are'} missing",
+            f"{counted(double, 'message')} contradict{'s' if double == 1 else ''} another of the same step",
+            "something in it is not of this run, or was altered",
+            "the senders' numbers have faults",
         ]
+        faults = (missing, double, self.strange, self.numbering)
+        return ", and ".join(words for words, fault in zip(found, faults, strict=True) if fault)
+
+    def _head(self) -> list[str]:
+        lines = [
+            f"{self.recording}: {self.headline()}",
+            f'run "{self.run}", seed {self.seed}, {self.steps} of {self.planned} steps, '
+            f"{counted(self.messages, 'message')}, {self.status}{f': {self.reason}' if self.reason else ''}",
+        ]
+        if self.part != Part():
+            lines.append(f"judged: {self.part.text()}")
         if self.damage:
             lines.append(f"the file: {self.damage}")
-        return lines
+        if self.gaps:
+            how = "not in this file" if self.status in ("cut", "continues") or self.damage else "left out of this file"
+            lines.append(f"{how}: {counted(self.lacking.total, 'message')} ({'; '.join(self.gaps)})")
+        return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def _proofs(self) -> list[str]:
         lines = [proof.text() for proof in self.proofs]
         if self.first_divergence:
+            ulps = self.first_divergence.ulps
             lines.append(
-                f"first divergence, {self.first_divergence.text()}: "
-                f"gap {self.first_divergence.gap:.1e}, tolerance {self.tolerance:.1e}"
+                f"first divergence, {self.first_divergence.text()}: gap {self.first_divergence.gap:.1e}, "
+                f"tolerance {self.tolerance:.1e}{'' if ulps is None else f', {_approximately(ulps)} apart'}"
             )
+            lines += self._later()
         elif self.worst:
             lines.append(
                 f"largest gap {self.worst_gap:.1e}, at step {self.worst.step} in {self.worst.place}; "
                 f"tolerance {self.tolerance:.1e} ({1.0 - self.worst_gap / self.tolerance:.0%} left)"
             )
         return lines
+
+    def _later(self) -> Iterator[str]:
+        total = sum(self.later.values())
+        if total:
+            kinds = sorted(self.later.items(), key=lambda kind: (-kind[1], kind[0]))
+            yield f"then {total} more: {', '.join(f'{count} of {kind}' for kind, count in kinds)}"
 
     def _faults(self) -> list[str]:
         lines = []
@@ -213,3 +311,8 @@ class Verdict:
 
     def _bound(self, energy: float) -> str:
         return f", gamma sqrt(energy) {self.gamma.value * energy**0.5:.4g} with gamma {self.gamma.value:.5g}"
+
+
+def _approximately(ulps: int) -> str:
+    """ "17 units in the last place"; large numbers in powers of ten."""
+    return f"{counted(ulps, 'unit') if ulps < 10**6 else f'{float(ulps):.1e} units'} in the last place"

@@ -47,9 +47,12 @@ class Account:
     trace: Trace
 
     @classmethod
-    def of(cls, path: Path) -> Account:
-        """Read and judge a recording. Raises InputError where it is none, RunBroken where it holds no step."""
-        log = load(path)
+    def of(cls, path: Path, *, run: str | None = None, gains: Path | None = None) -> Account:
+        """Read and judge a recording; `run` and `gains` as in `load`.
+
+        Raises InputError where it is none, RunBroken where it holds no step.
+        """
+        log = load(path, run=run, gains=gains)
         if not log.steps:
             raise RunBroken(f"{path} holds no step of its run, so there is nothing to report")
         trace = Trace(log.steps)

@@ -110,7 +110,7 @@ def test_what_is_none_of_these_is_refused_in_one_sentence(tmp_path: Path) -> Non
         ("empty", b"", "is neither a problem"),
         ("cut.json", gains[: len(gains) // 2], "is not valid JSON"),
         ("other.json", b'{"format": "other"}', "is not a gains file"),
-        ("cut.mcap", recording[:300], "cut or damaged before its first message"),
+        ("cut.mcap", recording[:100], "cut or damaged before its first message"),
         ("bad.toml", b"name = ", "is not valid TOML"),
         ("other.toml", b'name = "x"\n[tool]\na = 1\n', "this key is not known here"),
     ):

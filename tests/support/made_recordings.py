@@ -156,6 +156,7 @@ def simulate(
     seed: int = 1,
     real_y: dict[str, Any] | None = None,
     nudge: tuple[int, str, float] | None = None,
+    events: Sequence[tuple[int, str]] = (),
     uses: Mapping[tuple[int, str, str], bool] | None = None,
     says: Mapping[tuple[int, str, str], bool] | None = None,
     peeks: Container[tuple[int, str]] = (),
@@ -165,7 +166,8 @@ def simulate(
     """Every message of a lock-step run.
 
     `real_y` maps a node to (steps, ny) numbers from a real sensor, [] where it has none; `nudge` moves one node's
-    estimate at one step, and the run goes on from there.
+    estimate at one step, and the run goes on from there. `events` are steps and kinds of events of the coordinator
+    beside its first and last.
 
     Misdeeds: `uses` (step, receiver, sender) decides over a message in place of the seed, `says` what the receiver
     tells of it. At (step, node) of `peeks` a node uses the measurement that it lost. Where the gains are unbiased,
@@ -216,6 +218,8 @@ def simulate(
             )
         s = next(chain)
         mode = problem.mode_names[s]
+        for kind in (kind for step, kind in events if step == k):
+            sent.add("event", keys.COORDINATOR, step=k, kind=kind, who="coordinator", detail="")
         sent.add("mode", keys.COORDINATOR, step=k, mode=mode)
         before, x = x_hat, A @ x + B @ w
         phi, x_hat = deliveries.at(k), {}
@@ -252,6 +256,16 @@ class _Numbered:
         self._sent[sender] += 1
 
 
+def whole_run(problem: Problem, steps: int, external: str = "") -> dict[str, int]:
+    """How many messages each sender of `simulate` sends."""
+    simulated = [name for name in problem.node_names if name not in external.split(",")]
+    return {
+        keys.COORDINATOR: steps + 2,
+        keys.PLANT: steps * (1 + len(simulated)),
+        **{keys.node_who(name): steps for name in problem.node_names},
+    }
+
+
 def record(
     path: Path,
     gains: Gains,
@@ -263,14 +277,24 @@ def record(
     whole: bool = True,
     status: str = "finished",
     end_steps: int | None = None,
+    received: Mapping[str, int] | None = None,
     **facts: str,
 ) -> Path:
-    """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`."""
+    """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`.
+
+    `received` counts each sender's messages, as the recorder does; where it is not given, those of a whole run, and
+    of one without a plant where nothing of it is there and no node needs it.
+    """
     run = {"run": "test", "seed": str(seed), "steps": str(steps), "gains": gains.digest(), "external": "", **facts}
     with RecordingWriter(path, run=run, gains=gains) as writer:
         for time, message in enumerate(sent):
             payload = canonical(message.document)
             writer.add(Logged(message.topic, payload, message.number, time, time))
         if whole:
-            writer.finish({"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)})
+            external = facts.get("external", "")
+            counts = whole_run(gains.problem, steps, external) if received is None else dict(received)
+            if received is None and len(external.split(",")) == gains.problem.n:
+                counts = {who: count for who, count in counts.items() if any(message.who == who for message in sent)}
+            end = {"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)}
+            writer.finish(end | {f"received.{who}": str(count) for who, count in counts.items()})
     return path if whole else path.with_name(path.name + ".part")

@@ -1,98 +1,183 @@
-"""Reads a run back, whole or cut: as far as the file is sound, and never anything that was not written."""
+"""Reads a run back, whatever tool wrote the file last: as far as it is sound, and never anything that was not written.
+
+A file is walked twice: first over its frames, for metadata, attachments and damage (survey.py), then over its messages.
+"""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import Self
 
-import zstandard
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
-from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
-
-from agent.contract.errors import InputError
+from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
-from agent.contract.recording import FORMAT, VERSION, Logged
+from agent.contract.recording import Logged, contents, records
+from agent.contract.recording.contents import Run
+from agent.contract.recording.naming import Naming
+from agent.contract.recording.records import Broken, Channel, RawMessage
+from agent.contract.recording.source import Source
+from agent.contract.recording.survey import Survey, survey
 
-# A damaged length asks for more memory than there is, or than a machine can count.
-_DAMAGE = (McapError, struct.error, ValueError, zstandard.ZstdError, KeyError, EOFError, MemoryError, OverflowError)
+NAMED = 3  # so many damages are told, the others counted
+
+Progress = Callable[[int, int], None]  # bytes read, of all
 
 
 class RecordingReader:
-    """Reads a recording from front to back, whole or cut.
+    """Reads a recording, whole or cut, in one file or in several that hold parts of one run.
 
-    `run` and `gains` are there at once; `end` and `damage` after `messages()` has been read to its end. `end` is
-    None where the run's last word is missing, and `damage` says what is wrong with the file, "" where nothing is.
+    `run` and `gains` are there at once; `end` is None where the run's last word is missing. What is wrong with the
+    file is in `damage`, "" where nothing is, and what is odd but harmless in `notes`; both are complete after
+    `messages()` has been read to its end, and so are `foreign` and `others`. `is_alone`: the files hold no other run.
+
+    The argument `run` chooses among several runs by name or start, `gains` gives the gains file where it was left out.
+    Without `needs_gains` a recording that lost its gains is read too, and `gains` is refused when it is asked for.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.end: dict[str, str] | None = None
-        self.damage = ""
+    def __init__(
+        self,
+        path: Path | Source,
+        *more: Path,
+        run: str | None = None,
+        gains: Path | None = None,
+        needs_gains: bool = True,
+    ) -> None:
+        """A Source that is given is closed with the reader. Raises InputError for what is no recording."""
+        self._sources = [path] if isinstance(path, Source) else []
+        self.path = path.path if isinstance(path, Source) else path
+        self.paths = (self.path, *more)
+        self.foreign: Counter[str] = Counter()  # messages of topics that are not of a run
+        self.others = 0  # messages of the other runs in it
+        self.is_unchecked = False  # no checksum covers some messages
+        self._lost: list[str] = []  # what turned out to be damaged while messages were read
+        several = f"{self.path} and {len(more)} more"
+        self.label = label = " and ".join(map(str, self.paths)) if len(more) < 2 else several
         try:
-            self._file = path.open("rb")
-        except FileNotFoundError:
-            raise InputError(f"{path} does not exist; a recording was expected there") from None
-        except OSError as error:
-            raise InputError(f"{path} could not be read as a recording: {error.strerror}") from error
-        self._records = _records(self._file)
-        self._channels: dict[int, str] = {}
-        try:
-            self.run, self.gains = self._read_head()
-        except InputError:
-            self._file.close()
+            for one in self.paths[len(self._sources) :]:
+                self._sources.append(Source(one))
+            self._surveys = [survey(source) for source in self._sources]
+            self._followed: list[Path] = []
+            runs = contents.runs_in(self._surveys)
+            self._chosen = contents.chosen(runs, run, label=label)
+            while self._follow():
+                runs = contents.runs_in(self._surveys)
+                self._chosen = contents.chosen(runs, run, label=label)
+            self.is_alone = len(runs) == 1
+            self.window = contents.window(self._chosen, runs, label=label)
+            self._gains: Gains | None = None
+            self._given = gains
+            if needs_gains or gains is not None:
+                _ = self.gains
+        except BaseException:
+            self.close()
             raise
+        self.run, self.end = self._chosen.facts, self._chosen.end
+        self.size = sum(source.size for source in self._sources)
 
-    def _read_head(self) -> tuple[dict[str, str], Gains]:
-        run: dict[str, str] | None = None
+    def _follow(self) -> bool:
+        """Take in the next part of a run that continues, where it stands beside this file; False where none does."""
+        end = self._chosen.end
+        name = end.get("next", "") if end is not None and end["status"] == contents.CONTINUES else ""
+        if not name or Path(name).name != name:
+            return False
+        here = self.path.parent
+        there = [path for path in (here / name, here / f"{name}.part") if path.exists()]
+        if not there or there[0] in (*self.paths, *self._followed):
+            return False
+        source = Source(there[0])
+        self._sources.append(source)
         try:
-            for record in self._records:
-                if isinstance(record, Metadata) and record.name == "run":
-                    run = record.metadata
-                    if run.get("format") != FORMAT or run.get("version") != VERSION:
-                        raise InputError(
-                            f"{self.path} has recording format {run.get('format')} {run.get('version')}; "
-                            f"this peakmesh reads {FORMAT} {VERSION}"
-                        )
-                elif isinstance(record, Attachment) and record.name == "gains.json" and run is not None:
-                    return run, Gains.from_bytes(record.data, source=f"{self.path}: gains.json")
-                elif isinstance(record, McapMessage):
-                    break
-        except InvalidMagic:
-            raise InputError(f"{self.path} is not a recording: it is not an MCAP file") from None
-        except _DAMAGE as error:
-            raise InputError(
-                f"{self.path} is cut or damaged before its first message: {_why(error)}; nothing can be read"
-            ) from None
-        lack = "run metadata" if run is None else "gains"
-        raise InputError(f"{self.path} is an MCAP file, but not a recording of peakmesh: it has no {lack}")
+            part = survey(source)
+            if any(other.identity == self._chosen.identity for other in contents.runs_in([part])):
+                self._surveys.append(part)
+                self._followed.append(there[0])
+                return True
+        except InputError:  # it was killed before it had a head: the run ends here
+            pass
+        self._sources.pop().close()
+        return False
 
-    def messages(self) -> Iterator[Logged]:
-        """Every message in the order of the file, as far as the file is sound."""
-        try:
-            for record in self._records:
-                if isinstance(record, McapMessage):
-                    yield Logged(
-                        self._channels[record.channel_id],
-                        record.data,
-                        record.sequence,
-                        record.log_time,
-                        record.publish_time,
-                    )
-                elif isinstance(record, Channel):
-                    self._channels[record.id] = record.topic
-                elif isinstance(record, Metadata) and record.name == "end":
-                    self.end = record.metadata
-                elif isinstance(record, Metadata) and record.name == "run":
-                    self.damage = "it holds the beginning of a second run"
-            if self._file.read(1):
-                self.damage = "it goes on after its end, as if files had been joined"
-        except _DAMAGE as error:
-            self.damage = f"it is cut or damaged: {_why(error)}"
+    @property
+    def gains(self) -> Gains:
+        """Raises InputError where they were left out of the file."""
+        if self._gains is None:
+            self._gains = contents.find_gains(self._chosen, self._surveys, self._given, label=self.label)
+        return self._gains
+
+    @property
+    def damages(self) -> list[str]:
+        """What is wrong with the files, a sentence each; each begins with the file's name where there are several."""
+        found = [f"before it was recovered: {word}" for word in (self.run.get("recovered.damage"),) if word]
+        for one in self._surveys:
+            found += [self._of(one, sentence) for sentence in one.damage]
+        found += self._lost
+        if self.is_doubtful and "recovered.checksum" not in self.run:
+            found.append("it was changed after it was written: it does not fit its checksum")
+        return found
+
+    @property
+    def damage(self) -> str:
+        """`damages` as one text; of many the first, and how many more."""
+        found = self.damages
+        more = [f"{len(found) - NAMED} more damages"] if len(found) > NAMED else []
+        return "; ".join([*found[:NAMED], *more])
+
+    @property
+    def is_doubtful(self) -> bool:
+        """A checksum over everything fails, and nothing that was found explains it: any number may be a wrong one."""
+        if self.run.get("recovered.checksum") == "failed":
+            return True
+        return any(one.is_contradicted and not one.damage for one in self._surveys) and not self._lost
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd, and harms nothing."""
+        found = [self._of(one, sentence) for one in self._surveys for sentence in one.notes]
+        if self._followed:
+            found.append(f"it goes on in {', '.join(path.name for path in self._followed)}, which was read with it")
+        if self.is_unchecked:
+            found.append("no checksum covers the messages: what was changed later cannot be told from what was sent")
+        return found
+
+    @property
+    def strangers(self) -> list[str]:
+        """Metadata and attachments of others, by name."""
+        return list(dict.fromkeys(contents.strangers(self._chosen, self._surveys)))
+
+    @property
+    def faults(self) -> list[str]:
+        """What was altered beside the messages."""
+        told = self.run.get("recovered.faults")
+        return [*contents.altered(self._chosen, self._surveys), *([told] if told else [])]
+
+    def attachment(self, name: str) -> bytes | None:
+        """The bytes of the first sound attachment of this name, None where there is none."""
+        found = (contents.attachment(one, name) for one in self._surveys)
+        return next((data for data in found if data is not None), None)
+
+    def messages(self, report: Progress | None = None) -> Iterator[Logged]:
+        """Every message of the run in the order of the files, as far as they are sound."""
+        done = 0
+        self._lost.clear()
+        self.foreign.clear()
+        self.is_unchecked = self.run.get("recovered.checksum") == "none"
+        self.others = 0
+        for one in self._surveys:
+            yield from _Pass(self, one, done, report).messages()
+            done += one.source.size
+
+    def lose(self, one: Survey, sentence: str) -> None:
+        """Enter something that turned out to be lost while messages were read."""
+        self._lost.append(self._of(one, sentence))
+
+    def _of(self, one: Survey, sentence: str) -> str:
+        return f"{one.source.path}: {sentence}" if len(self._surveys) > 1 else sentence
+
+    def close(self) -> None:
+        for source in self._sources:
+            source.close()
 
     def __enter__(self) -> Self:
         return self
@@ -100,22 +185,91 @@ class RecordingReader:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self.close()
 
 
-def _records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """The records of a file; messages only out of chunks, where a checksum covers them."""
-    for record in StreamReader(file, validate_crcs=True, emit_chunks=True).records:
-        if isinstance(record, Chunk):
-            yield from breakup_chunk(record, validate_crc=True)
-        elif not isinstance(record, McapMessage):  # one outside a chunk is another record, damaged
-            yield record
+def runs_of(path: Path) -> list[Run]:
+    """The runs that a file holds, by a look at its metadata. Raises InputError where it holds none."""
+    source = Source(path)
+    try:
+        return contents.runs_in([survey(source)])
+    finally:
+        source.close()
 
 
-def _why(error: Exception) -> str:
-    text = str(error).rstrip(".")
-    if isinstance(error, EndOfFile | struct.error):
-        return "the file ends in the middle of a record"
-    if isinstance(error, MemoryError | OverflowError):
-        return "a record claims to be larger than memory"
-    return f"{type(error).__name__}: {text}"
+class _Pass:
+    """One pass over the messages of one file."""
+
+    def __init__(self, reader: RecordingReader, one: Survey, done: int, report: Progress | None) -> None:
+        self._reader, self._survey, self._source = reader, one, one.source
+        self._done, self._report = done, report
+        self._naming = Naming(one)
+        self._channels: dict[int, Channel] = {}
+        self._topics: dict[int, str] = {}  # of a channel of the run
+        self._chunks = self._orphans = 0
+
+    def messages(self) -> Iterator[Logged]:
+        first, before = self._reader.window
+        for raw in self._raw():
+            topic = self._topics.get(raw.channel) or self._unlearned(raw.channel)
+            if topic is None:
+                continue
+            if first <= raw.log_time < before:
+                yield Logged(topic, raw.data, raw.sequence, raw.log_time, raw.publish_time)
+            else:
+                self._reader.others += 1
+        if self._orphans:
+            self._reader.lose(self._survey, f"{counted(self._orphans, 'message')} are of channels not described in it")
+
+    def _raw(self) -> Iterator[RawMessage]:
+        """Every message of the sound stretches, in the order of the file."""
+        for frame in self._survey.frames():
+            if frame.opcode == records.MESSAGE and self._survey.has_loose:
+                self._reader.is_unchecked |= not self._survey.is_covered
+                yield records.message_of(self._survey.body(frame))
+            elif frame.opcode == records.CHUNK:
+                yield from self._chunk(self._survey.body(frame))
+            elif frame.opcode == records.CHANNEL:
+                self._learn(records.channel_of(self._survey.body(frame)))
+            elif frame.opcode == 0:
+                self._channels.clear()
+                self._topics.clear()
+            if self._report is not None:
+                self._report(self._done + frame.start, self._reader.size)
+
+    def _chunk(self, body: bytes) -> Iterator[RawMessage]:
+        self._chunks += 1
+        try:
+            chunk = records.chunk_of(body)
+            self._reader.is_unchecked |= not chunk.crc and not self._survey.is_covered
+            for record in records.records_in(records.unpacked(chunk)):
+                if isinstance(record, RawMessage):
+                    yield record
+                elif isinstance(record, Channel):
+                    self._learn(record)
+                else:
+                    self._naming.learn(record)
+        except Broken as error:
+            of = f"chunk {self._chunks} of {self._survey.chunks}"
+            self._reader.lose(self._survey, f"{of} {error}; its messages are lost")
+
+    def _learn(self, channel: Channel) -> None:
+        self._channels[channel.id] = channel
+        topic = self._naming.topic(channel)
+        if topic is None:
+            self._topics.pop(channel.id, None)
+        else:
+            self._topics[channel.id] = topic
+
+    def _unlearned(self, number: int) -> str | None:
+        """The topic of a channel that the file's index alone describes; None after counting a message of another."""
+        if number not in self._channels:
+            described = self._naming.described(number)
+            if described is None:
+                self._orphans += 1
+                return None
+            self._learn(described)
+            if number in self._topics:
+                return self._topics[number]
+        self._reader.foreign[self._channels[number].topic] += 1
+        return None

@@ -78,6 +78,10 @@ def _faults(account: Account) -> Iterator[str]:
     verdict = account.verdict
     if verdict.damage:
         yield f"The file: {verdict.damage}."
+    if verdict.gaps:
+        yield f"Not in this file: {counted(verdict.lacking.total, 'message')} ({'; '.join(verdict.gaps)})."
+    for note in verdict.notes:
+        yield f"Note: {note}."
     for word, faults in (("Missing", verdict.missing), ("Double", verdict.duplicates)):
         if faults.total:
             first = ", ".join(f"{place.topic} step {place.step}" for place in faults.first[:NAMED])

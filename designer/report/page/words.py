@@ -32,24 +32,25 @@ PROOFS = {  # what each proof of a replay shows, in plain words
 
 def verdict_word(verdict: Verdict) -> str:
     """One word, and the class of the style sheet: "sound", "not whole", "false"."""
-    if not verdict.agrees:
-        return "false"
-    return "sound" if verdict.finished else "not whole"
+    return {"agrees": "sound", "diverges": "false"}.get(verdict.outcome, "not whole")
 
 
 def verdict_sentence(verdict: Verdict) -> str:
     """Whether the recording can be believed."""
-    if not verdict.agrees:
+    if verdict.outcome == "unreadable":
+        return f"Nothing can be said of this recording: {verdict.damage or 'it holds nothing to compare'}."
+    if verdict.outcome == "diverges":
         return f"This recording is not a true account of the run: {_what_is_wrong(verdict)}."
     but = ", but for what the real sensors measured," if verdict.external else ""
     follows = (
         f"every number in it{but} was computed again, independently of the nodes, and is what this network must give, "
         "to within rounding"
     )
-    if verdict.finished:
+    if verdict.whole:
         return f"This recording can be believed: no message is missing, and {follows}."
     so_far = f"{verdict.steps} of {counted(verdict.planned, 'step')}"
-    why = verdict.reason or verdict.damage or "its end is missing"
+    lacking = f"{counted(verdict.lacking.total, 'message')} were left out of this file ({'; '.join(verdict.gaps)})"
+    why = verdict.reason or verdict.damage or (lacking if verdict.finished else "its end is missing")
     return f"As far as it goes this recording can be believed: {follows}. But it is not whole, it has {so_far}: {why}."
 
 

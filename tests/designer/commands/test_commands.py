@@ -122,7 +122,8 @@ def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: 
     assert run("report", "run.mcap", "--json") == 0
     done = json.loads(capsys.readouterr().out)
     assert done == {
-        "recording": "run.mcap", "agrees": True, "finished": True, "report": "run.html", "figures": [], "data": [],
+        "recording": "run.mcap", "agrees": True, "finished": True, "whole": True, "report": "run.html", "figures": [],
+        "data": [],
     }  # fmt: skip
     assert Path("run.html").read_text().startswith("<!doctype html>")
     assert run("report", "run.mcap") == 2

@@ -1,0 +1,28 @@
+"""What of a log is judged, where that is not all of it."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple
+
+
+class Part(NamedTuple):
+    """Steps `first` to `last`, and one node alone where `node` is given."""
+
+    first: int = 0
+    last: int = sys.maxsize
+    node: str | None = None
+
+    def has(self, topic: str, step: int | None = None) -> bool:
+        """Whether a topic belongs to it, and a step where one is given."""
+        ours = self.node is None or topic.startswith(f"node/{self.node}/")
+        return ours and (step is None or self.first <= step <= self.last)
+
+    def text(self) -> str:
+        steps = f"steps {self.first} to {self.last}" if self.last < sys.maxsize else f"steps from {self.first} on"
+        return steps if self.node is None else f'{steps}, node "{self.node}" alone'
+
+    def document(self) -> dict[str, Any]:
+        """For --json; None where nothing is left out."""
+        last = self.last if self.last < sys.maxsize else None
+        return {"from": self.first or None, "to": last, "node": self.node}
