@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite, write_whole
-from designer.commands.recordings import add_choice
+from designer.commands.recordings import Progress, add_choice
 
 if TYPE_CHECKING:
     from designer.report.account import Account
@@ -23,7 +24,10 @@ def add_report(commands: Subcommands) -> None:
     report = add_command(
         commands, "report", report_command, "a recording as one page: the verdict, and what happened, in pictures"
     )
-    report.add_argument("recording", type=Path, metavar="RECORDING", help="recording, or the .part of one that was cut")
+    report.add_argument(
+        "recordings", type=Path, nargs="+", metavar="RECORDING", help="recording, or the parts of one run"
+    )
+    add_choice(report)
     report.add_argument("-o", "--output", type=Path, metavar="FILE", help="HTML file (RECORDING.html)")
     add_choice(report)
     add_figures(report, "write every picture for a paper into this folder; the page only where --output names it")
@@ -43,31 +47,30 @@ def add_figures(parser: argparse.ArgumentParser, about: str) -> None:
 def report_command(options: argparse.Namespace) -> int:
     """`peakmesh report RECORDING`: the exit code says that it was written; the verdict is replay's to give.
 
-    The object of --json: recording, agrees, finished and whole as replay says them, report (the page, or null), figures
-    and data (files).
+    The object of --json: recording, agrees and outcome as replay says them, report (the page, or null), figures and
+    data (files).
     """
     refuse_lone_options(options)
     output = options.output
     if output is None and options.figures is None:
-        output = default_page(options.recording)
+        output = default_page(options.recordings[0])
     if output is not None:
-        refuse_page(output, options.recording, force=options.force)
+        refuse_page(output, options.recordings, force=options.force)
     from designer.report.account import Account
 
-    account = Account.of(options.recording, run=options.run, gains=options.gains)
+    account = Account.of(*options.recordings, run=options.run, gains=options.gains, report=Progress())
     figures, data = write_figures(account, options) if options.figures is not None else ([], [])
     if output is not None:
         write_page(account, output, force=options.force)
     facts = {
-        "recording": str(options.recording),
+        "recording": account.verdict.recording,
         "agrees": account.verdict.agrees,
-        "finished": account.verdict.finished,
-        "whole": account.verdict.whole,
+        "outcome": account.verdict.outcome,
         "report": None if output is None else str(output),
         "figures": [str(path) for path in figures],
         "data": [str(path) for path in data],
     }
-    print(json.dumps(facts) if options.json else _text(facts, options.figures))
+    print(json.dumps(facts) if options.json else _text(facts, account.verdict.headline(), options.figures))
     return EXIT_GOOD
 
 
@@ -85,9 +88,9 @@ def default_page(recording: Path) -> Path:
     return recording.with_name(recording.name.removesuffix(".part").removesuffix(".mcap") + ".html")
 
 
-def refuse_page(page: Path, recording: Path, *, force: bool) -> None:
+def refuse_page(page: Path, recordings: Sequence[Path], *, force: bool) -> None:
     """Raise InputError where the page would replace what it must not."""
-    if page.exists() and recording.exists() and page.samefile(recording):
+    if page.exists() and any(recording.exists() and page.samefile(recording) for recording in recordings):
         raise InputError(f"{page} is the recording itself; give the page another name")
     refuse_overwrite(page, force=force)
 
@@ -117,9 +120,8 @@ def write_figures(account: Account, options: argparse.Namespace) -> tuple[list[P
     return written, tables.write(numbers, options.figures, force=options.force)
 
 
-def _text(facts: dict[str, Any], folder: Path | None) -> str:
+def _text(facts: dict[str, Any], headline: str, folder: Path | None) -> str:
     lines = [] if facts["report"] is None else [f"report     {facts['report']}"]
     for name in ("figures", "data"):
         lines += [f"{name:10} {len(facts[name])} files in {folder}"] if facts[name] else []
-    verdict = "the recording agrees" if facts["agrees"] else "the recording DIVERGES"
-    return "\n".join([*lines, f"verdict    {verdict}{'' if facts['whole'] else '; it is not whole'}"])
+    return "\n".join([*lines, f"verdict    {headline}"])

@@ -15,7 +15,7 @@ from agent.contract.errors import InputError, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.problem.disturbance import White
 from designer.ladder import ladder_of
-from designer.replay import judge
+from designer.replay import Report, judge
 from designer.replay.log import Log, load
 from designer.replay.trace import Trace
 from designer.replay.verdict import Verdict
@@ -45,18 +45,22 @@ class Account:
     log: Log
     verdict: Verdict
     trace: Trace
+    paths: tuple[Path, ...]  # the files
 
     @classmethod
-    def of(cls, path: Path, *, run: str | None = None, gains: Path | None = None) -> Account:
-        """Read and judge a recording; `run` and `gains` as in `load`.
+    def of(
+        cls, *paths: Path, run: str | None = None, gains: Path | None = None, report: Report | None = None
+    ) -> Account:
+        """Read and judge a recording, or the parts of one; `run`, `gains` and `report` as in `replay`.
 
-        Raises InputError where it is none, RunBroken where it holds no step.
+        Raises InputError for what is no recording, RunBroken where it holds no step.
         """
-        log = load(path, run=run, gains=gains)
+        tell = report or (lambda what, done, of: None)
+        log = load(paths, run=run, gains=gains, report=lambda done, of: tell("reading", done, of))
         if not log.steps:
-            raise RunBroken(f"{path} holds no step of its run, so there is nothing to report")
+            raise RunBroken(f"{log.label} holds no step of its run, so there is nothing to report")
         trace = Trace(log.steps)
-        return cls(log, judge(log, trace), trace)
+        return cls(log, judge(log, trace, report=report), trace, paths)
 
     @cached_property
     def errors(self) -> Array:

@@ -17,7 +17,7 @@ from designer.report.scales import brief
 
 ROWS = 12  # of the nodes' table that stand open
 NAMED = 8  # faults of a kind that are named
-MARKS = {"sound": "✓", "not whole": "◐", "false": "✗"}
+MARKS = {"agrees": "✓", "agrees for what is there": "◐", "diverges": "✗", "unreadable": "?"}
 VERSIONS = ("peakmesh", "python", "numpy", "eclipse-zenoh", "pydantic", "mcap")
 NODE_HEADS = (
     "node", "root mean square", "largest", "at step", "measurements lost", "by the model", "messages not used",
@@ -27,13 +27,13 @@ NODE_HEADS = (
 def head(account: Account) -> str:
     """What was run, the verdict on it, and the numbers that count."""
     verdict, problem = account.verdict, account.log.gains.problem
-    word = words.verdict_word(verdict)
+    sentence = escape(words.verdict_sentence(verdict))
     tiles = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for value, what in _tiles(account))
     return (
         f'<p class="kicker">peakmesh, report of a run</p><h1>{escape(problem.name)}'
         f"<small>run {escape(verdict.run)}, seed {verdict.seed}</small></h1>"
-        f'<section class="verdict {word.replace(" ", "-")}" aria-label="Verdict">'
-        f'<span aria-hidden="true">{MARKS[word]}</span><p><b>{escape(words.verdict_sentence(verdict))}</b></p>'
+        f'<section class="verdict {verdict.outcome.replace(" ", "-")}" aria-label="Verdict">'
+        f'<span aria-hidden="true">{MARKS[verdict.outcome]}</span><p><b>{sentence}</b></p>'
         f'<p>{escape(words.error_sentence(account))}</p></section><dl class="tiles">{tiles}</dl>'
     )
 
@@ -78,16 +78,16 @@ def _faults(account: Account) -> Iterator[str]:
     verdict = account.verdict
     if verdict.damage:
         yield f"The file: {verdict.damage}."
-    if verdict.gaps:
-        yield f"Not in this file: {counted(verdict.lacking.total, 'message')} ({'; '.join(verdict.gaps)})."
-    for note in verdict.notes:
-        yield f"Note: {note}."
+    for gap in verdict.gaps:
+        yield f"Not in this file: {gap}."
     for word, faults in (("Missing", verdict.missing), ("Double", verdict.duplicates)):
         if faults.total:
             first = ", ".join(f"{place.topic} step {place.step}" for place in faults.first[:NAMED])
             yield f"{word}: {counted(faults.total, 'message')}; first {first}."
     for fault in (*verdict.strange, *verdict.numbering)[:NAMED]:
         yield f"{fault}."
+    for note in verdict.notes:
+        yield f"Note: {note}."
     if verdict.external:
         yield f"Real sensors: {', '.join(verdict.external)}. Estimates are compared in place of errors."
 
@@ -144,8 +144,7 @@ def provenance(account: Account) -> str:
     log, run = account.log, account.log.run
     again = f"peakmesh run gains.json --steps {log.planned} --seed {log.seed}"
     facts = [
-        ("recording", log.path.name),
-        ("SHA-256 of the file", _sha256(log.path)),
+        *((f"recording {path.name}", f"SHA-256 {_sha256(path)}") for path in account.paths if path.is_file()),
         ("run", run.get("run", "")),
         ("started", run.get("started", "")),
         ("seed", str(log.seed)),
@@ -154,9 +153,9 @@ def provenance(account: Account) -> str:
         ("certificate", account.verdict.gamma.text().removeprefix("certificate").strip()),
         ("made with", ", ".join(f"{name} {run[name]}" for name in VERSIONS if name in run)),
         ("the same run again", "not possible: real sensors took part" if any(log.external) else again),
-        ("the verdict again", f"peakmesh replay {log.path.name}"),
+        ("the verdict again", f"peakmesh replay {' '.join(path.name for path in account.paths)}"),
     ]
-    rows = "".join(f"<div><dt>{name}</dt><dd>{escape(text)}</dd></div>" for name, text in facts if text)
+    rows = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in facts if text)
     attached = "<p>gains.json is attached to the recording.</p>"
     return f'<section id="provenance"><h2>Where this comes from</h2><dl>{rows}</dl>{attached}</section>'
 

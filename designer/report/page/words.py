@@ -30,39 +30,48 @@ PROOFS = {  # what each proof of a replay shows, in plain words
 }
 
 
-def verdict_word(verdict: Verdict) -> str:
-    """One word, and the class of the style sheet: "sound", "not whole", "false"."""
-    return {"agrees": "sound", "diverges": "false"}.get(verdict.outcome, "not whole")
-
-
 def verdict_sentence(verdict: Verdict) -> str:
     """Whether the recording can be believed."""
-    if verdict.outcome == "unreadable":
-        return f"Nothing can be said of this recording: {verdict.damage or 'it holds nothing to compare'}."
-    if verdict.outcome == "diverges":
-        return f"This recording is not a true account of the run: {_what_is_wrong(verdict)}."
+    match verdict.outcome:
+        case "diverges":
+            return f"This recording is not a true account of the run: {_what_is_wrong(verdict)}."
+        case "unreadable" if verdict.agrees:
+            return "Of this recording nothing can be said: it holds nothing that could be computed again."
+        case "unreadable":
+            return "Of this recording nothing can be said: its bytes were changed after it was written."
     but = ", but for what the real sensors measured," if verdict.external else ""
     follows = (
         f"every number in it{but} was computed again, independently of the nodes, and is what this network must give, "
         "to within rounding"
     )
-    if verdict.whole:
+    if verdict.outcome == "agrees":
         return f"This recording can be believed: no message is missing, and {follows}."
-    so_far = f"{verdict.steps} of {counted(verdict.planned, 'step')}"
-    lacking = f"{counted(verdict.lacking.total, 'message')} were left out of this file ({'; '.join(verdict.gaps)})"
-    why = verdict.reason or verdict.damage or (lacking if verdict.finished else "its end is missing")
-    return f"As far as it goes this recording can be believed: {follows}. But it is not whole, it has {so_far}: {why}."
+    return f"As far as it goes this recording can be believed: {follows}. But it is not whole: {_what_lacks(verdict)}."
+
+
+def _what_lacks(verdict: Verdict) -> str:
+    """In a few words: how far the run goes, what the file has not of it, and why."""
+    said = []
+    if verdict.steps < verdict.planned:
+        said.append(f"it has {verdict.steps} of {counted(verdict.planned, 'step')}")
+    if verdict.lacking.total:
+        said.append(f"{counted(verdict.lacking.total, 'message')} of the run {_are(verdict.lacking.total)} not in it")
+    why = verdict.reason or verdict.damage or ("" if said else "its end is missing")
+    return "; ".join([*said, *([why] if why else [])])
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"
 
 
 def _what_is_wrong(verdict: Verdict) -> str:
     if verdict.first_divergence is not None:
         return divergence_sentence(verdict.first_divergence)
-    for faults, word in ((verdict.missing, "missing"), (verdict.duplicates, "there more than once")):
+    for faults, word in ((verdict.missing, "missing"), (verdict.duplicates, "contradicted by another of its step")):
         if faults.total:
             first = faults.first[0]
-            are = "is" if faults.total == 1 else "are"
             where = f"the first is {first.topic} of step {first.step}"
-            return f"{counted(faults.total, 'message')} {are} {word}; {where}"
+            return f"{counted(faults.total, 'message')} {_are(faults.total)} {word}; {where}"
     for fault in (*verdict.strange, *verdict.numbering):
         return fault
     return "the errors were larger than a disturbance of this size can make them"

@@ -122,8 +122,7 @@ def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: 
     assert run("report", "run.mcap", "--json") == 0
     done = json.loads(capsys.readouterr().out)
     assert done == {
-        "recording": "run.mcap", "agrees": True, "finished": True, "whole": True, "report": "run.html", "figures": [],
-        "data": [],
+        "recording": "run.mcap", "agrees": True, "outcome": "agrees", "report": "run.html", "figures": [], "data": [],
     }  # fmt: skip
     assert Path("run.html").read_text().startswith("<!doctype html>")
     assert run("report", "run.mcap") == 2
@@ -132,7 +131,7 @@ def test_report_writes_beside_the_recording(folder: Path, gains: Gains, capsys: 
     assert "run.mcap is the recording itself" in capsys.readouterr().err
     assert run("report", "run.mcap", "-o", ".") == 2
     assert run("report", "run.mcap", "--force") == 0
-    assert "report     run.html\nverdict    the recording agrees" in capsys.readouterr().out
+    assert "report     run.html\nverdict    agrees" in capsys.readouterr().out
 
 
 def test_report_writes_figures_and_tables(folder: Path, gains: Gains, capsys: pytest.CaptureFixture[str]) -> None:

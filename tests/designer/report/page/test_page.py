@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
 import zlib
@@ -188,6 +189,32 @@ def test_a_missing_message_is_named_and_a_cut_file_is_not_accused(tmp_path: Path
     assert said.startswith("As far as it goes this recording can be believed: ")
     assert f"it has {cut.log.steps} of 20 steps" in said
     assert said in Checked(page(cut)).text
+
+
+def test_what_a_filter_left_out_is_named_and_accuses_nobody(tmp_path: Path) -> None:
+    """A whole topic that is not there."""
+    gains = random_gains(random_problem(3))
+    kept = [message for message in simulate(gains, steps=20) if message.topic != "event"]
+    account = Account.of(record(tmp_path / "run.mcap", gains, kept, steps=20))
+    assert "But it is not whole: 2 messages of the run are not in it." in verdict_sentence(account.verdict)
+    assert "Not in this file: topic event." in Checked(page(account)).text
+    assert "✗" not in page(account)
+
+
+def test_parts_of_a_run_are_one_report(tmp_path: Path) -> None:
+    """Both files are named, each with its digest."""
+    gains = random_gains(random_problem(3))
+    sent = simulate(gains, steps=20)
+    halves = [
+        record(tmp_path / f"{name}.mcap", gains, half, steps=20)
+        for name, half in (("first", sent[:90]), ("second", sent[90:]))
+    ]
+    account = Account.of(*halves)
+    text = Checked(page(account)).text
+    assert account.log.steps == 20
+    assert verdict_sentence(account.verdict).startswith("This recording can be believed")
+    for path in halves:
+        assert f"recording {path.name}SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()}" in text
 
 
 def test_of_real_sensors_it_claims_no_more_than_it_knows(tmp_path: Path) -> None:
