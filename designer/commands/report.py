@@ -27,7 +27,6 @@ def add_report(commands: Subcommands) -> None:
     report.add_argument(
         "recordings", type=Path, nargs="+", metavar="RECORDING", help="recording, or the parts of one run"
     )
-    add_choice(report)
     report.add_argument("-o", "--output", type=Path, metavar="FILE", help="HTML file (RECORDING.html)")
     add_choice(report)
     add_figures(report, "write every picture for a paper into this folder; the page only where --output names it")
