@@ -112,12 +112,26 @@ class Control(Frozen):
     reason: str
 
 
+class BrokenOff(Frozen):
+    """The recording could not be written any more, because `reason`; it holds every step < `steps`.
+
+    `stop`: the run is to end for that; otherwise it goes on without a recording.
+    """
+
+    reason: str
+    steps: int
+    stop: bool
+
+    def __str__(self) -> str:
+        return f"{self.reason}; there is no recording from step {self.steps} on"
+
+
 class Acknowledged(Frozen):
-    """The recorder's word: it holds the first `received[who]` messages of everyone, and every step < `steps`.
+    """The recorder's word: it has the first `received[who]` messages of everyone, and every step < `steps`.
 
     `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of
-    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name;
-    everybody may go.
+    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name,
+    or is `broken_off`; everybody may go.
     """
 
     steps: int
@@ -127,6 +141,7 @@ class Acknowledged(Frozen):
     reached: dict[str, int]
     lacking: list[str]
     closed: bool
+    broken_off: BrokenOff | None = None
 
 
 class Stamp(NamedTuple):

@@ -26,7 +26,6 @@ from designer.replay.census import Census, Facts, take_census
 from designer.replay.part import Part
 from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
-EVIDENCE = "evidence"  # the recorder's own topic: what senders say of their messages
 _NAMED = 3  # so many damages and topics are named
 _LARGEST = 1 << 33  # bytes of the arrays that hardly any message fills
 

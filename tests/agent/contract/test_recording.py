@@ -15,7 +15,7 @@ from made_recordings import random_gains, random_problem, record, simulate
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from agent.contract.errors import InputError, RunBroken
+from agent.contract.errors import InputError, RecordingFailed, RunBroken
 from agent.contract.files import canonical
 from agent.contract.gains import Gains
 from agent.contract.recording import Logged
@@ -76,7 +76,7 @@ def refusal(path: Path) -> str:
 
 # what was written is read
 def test_everything_comes_back_exactly(tmp_path: Path) -> None:
-    truth = Read(MESSAGES, {"format": "peakmesh-recording", "version": "1", **RUN}, GAINS, END, "", [])
+    truth = Read(MESSAGES, {"format": "peakmesh-recording", "version": "1", "part": "1", **RUN}, GAINS, END, "", [])
     assert read(write(tmp_path / "run.mcap")) == truth
     assert not (tmp_path / "run.mcap.part").exists()
 
@@ -131,7 +131,7 @@ def test_a_file_cut_at_any_byte_gives_a_prefix_or_is_refused(tmp_path: Path, mon
         for number, message in enumerate(MESSAGES):
             writer.add(message)
             if number % 4 == 0:
-                writer._writer.flush()  # so that there are several chunks
+                writer._part._writer.flush()  # so that there are several chunks
         writer.finish(END)
     lengths, refused = set(), False
     for cut in reversed(range(path.stat().st_size)):
@@ -213,7 +213,7 @@ def test_what_stands_after_the_end_is_left_alone(tmp_path: Path, tail: bytes, ki
 def test_a_second_run_in_a_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, run=RUN, gains=GAINS) as writer:
-        writer._writer.add_metadata("run", {"format": "peakmesh-recording", "version": "1", "run": "b", "seed": "4"})
+        writer._part._writer.add_metadata("run", {"format": "peakmesh-recording", "version": "1", "run": "b", "seed": "4"})
         writer.finish(END)
     assert refusal(path) == ' holds 2 runs, "test" (seed ?) and "b" (seed 4); choose one by --run NAME'
 
@@ -336,7 +336,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pyt
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(InputError, match=r"run\.mcap could not be written: Permission denied$"):
+    with pytest.raises(RecordingFailed, match=r"run\.mcap could not be written: Permission denied$"):
         RecordingWriter(tmp_path / "run.mcap", run=RUN, gains=GAINS)
 
 
