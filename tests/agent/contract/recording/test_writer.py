@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
-import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from disks import disk_of
 from made_recordings import random_gains, random_problem, record, simulate
 from places import ROOT
 
@@ -276,17 +274,6 @@ def test_parts_of_an_older_recording_are_not_mixed_with_a_new_one(tmp_path: Path
 
 
 # where writing fails
-@contextlib.contextmanager
-def disk_of(size: int) -> Iterator[None]:
-    """No file may become longer than this, as if the disk was full then."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def fill(path: Path, *, size: int, every: int, split: Split | None = None) -> tuple[int, str]:
     """Write until the disk is full; how many messages the writer says to hold, and what it says."""
     random_payloads = random.Random(size)
