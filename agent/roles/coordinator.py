@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from agent.contract.errors import InputError, PeakmeshError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import EVENT, MODE, in_words, participants, sensor_who
+from agent.contract.keys import COORDINATOR, EVENT, MODE, RECORDER, in_words, participants, sensor_who
 from agent.contract.messages import Acknowledged, BrokenOff, Control, Event, Mode
 from agent.contract.schedule import modes
 from agent.network.bus import Bus
@@ -151,8 +151,8 @@ class Conductor:
             )
         )
 
-    def _announce(self, kind: str, detail: str) -> None:
-        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=self._bus.who, detail=detail))
+    def _announce(self, kind: str, detail: str, *, who: str = COORDINATOR) -> None:
+        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=who, detail=detail))
 
     def _wait_for_progress(self) -> None:
         """Until the recorder holds one more step, the deadline passes, or somebody is lost.
@@ -183,7 +183,7 @@ class Conductor:
         self._broken_off = broken_off
         if broken_off.stop:
             raise RecordingFailed(str(broken_off))
-        self._announce("unrecorded", str(broken_off))
+        self._announce("unrecorded", str(broken_off), who=RECORDER)
         self._report({"broken_off": str(broken_off)})
 
     def _takes_part(self, who: str) -> bool:
