@@ -212,7 +212,9 @@ def test_what_stands_after_the_end_is_left_alone(tmp_path: Path, tail: bytes, ki
 def test_a_second_run_in_a_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, run=RUN, gains=GAINS) as writer:
-        writer._part._writer.add_metadata("run", {"format": "peakmesh-recording", "version": "1", "run": "b", "seed": "4"})
+        writer._part._writer.add_metadata(
+            "run", {"format": "peakmesh-recording", "version": "1", "run": "b", "seed": "4"}
+        )
         writer.finish(END)
     assert refusal(path) == ' holds 2 runs, "test" (seed ?) and "b" (seed 4); choose one by --run NAME'
 

@@ -1,4 +1,4 @@
-"""A recording that was cut or damaged replays as far as it goes: never a traceback, never a message that was not sent."""
+"""A recording that was cut or damaged replays as far as it goes: no traceback, and no message that was not sent."""
 
 from __future__ import annotations
 
@@ -48,9 +48,8 @@ def said_of(path: Path, truth: set[Logged]) -> str:
             messages = list(reader.messages())
             damage = reader.damage
     except PeakmeshError as error:
-        assert "\n" not in str(error)
-        assert str(path) in str(error)
-        return "refused"
+        sentence = str(error)
+        return "refused" if sentence.startswith(str(path)) and "\n" not in sentence else sentence
     assert set(messages) <= truth
     assert verdict.first_divergence is None
     if verdict.exit_code == 0:

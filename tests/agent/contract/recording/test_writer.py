@@ -175,7 +175,7 @@ def test_a_closed_recording_can_be_closed_again(tmp_path: Path) -> None:
 
 
 def test_helpers_of_other_tests_write_whole_recordings(tmp_path: Path) -> None:
-    path = record(tmp_path / "run.mcap", GAINS, simulate(GAINS, steps=2), steps=2)
+    path = record(tmp_path / "run.mcap", GAINS, simulate(GAINS, steps=2), steps=2, evidence=False)
     assert [message.payload for message in messages_of(path)] == [message.payload for message in MESSAGES]
 
 
