@@ -22,7 +22,8 @@ from typing import IO, Any, NamedTuple
 from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
-from agent.plan import Plan
+from agent.contract.recording.parts import files_of
+from agent.plan import Plan, RecordingPlan
 from agent.signals import heed, restore
 
 RECORDER_SECONDS = 60.0  # after the coordinator has gone, the recorder has so long to close before it is killed
@@ -52,17 +53,20 @@ def launch(
     force: bool,
     wait: float,
     report: Callable[[dict[str, Any]], None],
+    recording_plan: RecordingPlan | None = None,
 ) -> dict[str, Any]:
     """Run everything on this machine; returns the coordinator's summary. `report` gets its words as they come.
 
-    Raises what the run ended with: RunBroken, Interrupted, or InputError. No process is left behind.
+    Raises what the run ended with: RunBroken, Interrupted, or InputError. No process is left behind. A run that went
+    on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
     began = time.time()
     common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
     commands |= {node_who(name): ["node", *common, "--node", name] for name in gains.problem.node_names}
     commands[PLANT] = ["plant", *common]
-    commands[RECORDER] = ["recorder", *common, "--output", str(recording), *(["--force"] if force else [])]
+    options = _recorder_options(recording_plan or RecordingPlan(), force=force)
+    commands[RECORDER] = ["recorder", *common, "--output", str(recording), *options]
     with _Crew() as crew:
         for who, command in commands.items():
             crew.start(who, command)
@@ -78,11 +82,11 @@ def launch(
             report(word)
         crew.wait()
         try:
-            crew.raise_what_happened()
+            crew.raise_what_happened(finished="steps" in summary)
         except RunBroken as error:
-            kept = [path for path in (recording.with_name(recording.name + ".part"), recording) if path.exists()]
+            kept = files_of(recording)
             if crew.started and kept:
-                error.args = (f"{error}; what was recorded is in {kept[0]}",)
+                error.args = (f"{error}; what was recorded is in {' and '.join(map(str, kept))}",)
             raise
     if "steps" not in summary:
         raise RunBroken("the coordinator ended without a summary")
@@ -94,6 +98,15 @@ def _plan_options(plan: Plan) -> list[str]:
     for node in plan.external:
         options += ["--external", node]
     return [str(option) for option in options]
+
+
+def _recorder_options(plan: RecordingPlan, *, force: bool) -> list[str]:
+    options = ["--on-record-failure", "continue" if plan.goes_on else "stop", *(["--force"] if force else [])]
+    if plan.split_size is not None:
+        options += ["--split-size", str(plan.split_size)]
+    if plan.split_seconds is not None:
+        options += ["--split-duration", str(plan.split_seconds)]
+    return options
 
 
 class _Crew:
@@ -144,7 +157,8 @@ class _Crew:
         for child in self._children.values():
             _wait_or_kill(child.process, deadline - time.monotonic())
 
-    def raise_what_happened(self) -> None:
+    def raise_what_happened(self, *, finished: bool) -> None:
+        """`finished`: the coordinator has given its summary."""
         coordinator = self._children[COORDINATOR]
         code = coordinator.process.returncode
         if self._signal is not None:
@@ -152,7 +166,7 @@ class _Crew:
         if self._failed is not None:
             child = self._children[self._failed]
             self._raise(child, f"{in_words(self._failed)} ended before the run had started")
-        if code != 0:
+        if code != 0 and not finished:
             self._raise(coordinator, "the coordinator ended without a word")
 
     def _raise(self, child: Child, otherwise: str) -> None:

@@ -1,4 +1,4 @@
-"""What a coordinator is to do."""
+"""What a coordinator is to do, and a recorder."""
 
 from __future__ import annotations
 
@@ -16,3 +16,12 @@ class Plan:
     window: int = 32  # steps that modes and measurements may run ahead of what is recorded
     deadline: float = 10.0  # seconds without progress
     external: tuple[str, ...] = ()  # nodes whose measurements come from a sensor
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """What only the recorder decides."""
+
+    split_size: int | None = None  # bytes of messages after which a new part of the recording begins
+    split_seconds: float | None = None
+    goes_on: bool = False  # whether the run does where it cannot be recorded any more

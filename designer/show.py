@@ -8,6 +8,7 @@ from typing import Any
 
 from agent.contract.errors import InputError, counted, listed
 from agent.contract.gains import Gains
+from agent.contract.keys import EVIDENCE
 from agent.contract.problem import Problem
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
@@ -138,7 +139,7 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _recording(reader: RecordingReader, report: Progress | None) -> dict[str, Any]:
-    counts = Counter(logged.topic for logged in reader.messages(report))
+    counts = Counter(logged.topic for logged in reader.messages(report) if logged.topic != EVIDENCE)
     run, end, notes = reader.run, reader.end or {}, [*reader.notes]
     try:
         gains: Gains | None = reader.gains

@@ -27,7 +27,7 @@ ROOMS = {
     "agent.signals": "",
     "agent.network": "agent.plan agent.signals",
     "agent.roles": "agent.contract.recording agent.filter agent.inbox agent.network agent.plan agent.receipts",
-    "agent.launch": "agent.plan agent.signals",
+    "agent.launch": "agent.contract.recording agent.plan agent.signals",
     "agent.commands": "agent.contract.recording agent.launch agent.network agent.plan agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",

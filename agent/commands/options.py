@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from agent.contract.errors import InputError
-from agent.plan import LARGEST_WINDOW, Plan
+from agent.plan import LARGEST_WINDOW, Plan, RecordingPlan
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -54,6 +54,30 @@ def add_output_options(parser: argparse.ArgumentParser, metavar: str, about: str
     parser.add_argument("--force", action="store_true", help="replace what exists")
 
 
+def add_recording_options(parser: argparse.ArgumentParser) -> None:
+    """Add what the recorder decides; `recording_plan_of` reads it."""
+    parser.add_argument(
+        "--split-size",
+        type=_size,
+        metavar="SIZE",
+        help="begin a new part of the recording after so much, for example 100MB: FILE, FILE.part2, ... (never)",
+    )
+    parser.add_argument(
+        "--split-duration", type=_duration, metavar="TIME", help="or after so long, for example 90s, 10min, 2h (never)"
+    )
+    parser.add_argument(
+        "--on-record-failure",
+        choices=("stop", "continue"),
+        default="stop",
+        help="what the run does where it cannot be recorded any more (stop); the exit code is 3 in both cases",
+    )
+
+
+def recording_plan_of(options: argparse.Namespace) -> RecordingPlan:
+    """What the options of `add_recording_options` ask for."""
+    return RecordingPlan(options.split_size, options.split_duration, options.on_record_failure == "continue")
+
+
 def run_name(text: str) -> str:
     """The type of --run."""
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,128}", text):  # it becomes one part of every key expression
@@ -70,6 +94,30 @@ def positive(text: str) -> float:
     if not 0.0 < value < 1e9:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number of seconds")
     return value
+
+
+_BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+_SECONDS = {"": 1, "s": 1, "min": 60, "h": 3600}
+
+
+def _size(text: str) -> int:
+    size = _with_unit(text, _BYTES)
+    if not 1000 <= size <= 1e15:
+        raise argparse.ArgumentTypeError(f"{text} is not a size from 1kB on, such as 500kB, 100MB or 2GB")
+    return int(size)
+
+
+def _duration(text: str) -> float:
+    seconds = _with_unit(text, _SECONDS)
+    if not 1 <= seconds <= 1e9:
+        raise argparse.ArgumentTypeError(f"{text} is not a time from 1s on, such as 90s, 10min or 2h")
+    return seconds
+
+
+def _with_unit(text: str, units: Mapping[str, int]) -> float:
+    """A number with one of the units; 0 for anything else."""
+    found = re.fullmatch(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?([a-z]*)", text.lower())
+    return float(found[1]) * units[found[2]] if found and found[2] in units else 0.0
 
 
 def _whole(text: str, *, least: int, most: int) -> int:

@@ -18,14 +18,16 @@ from agent.commands.options import (
     add_command,
     add_output_options,
     add_plan_options,
+    add_recording_options,
     default_recording,
     load_gains,
     plan_of,
     positive,
+    recording_plan_of,
     run_name,
 )
-from agent.commands.words import say_to_launcher, say_to_person
-from agent.contract.errors import EXIT_GOOD, InputError, RunBroken
+from agent.commands.words import say_broken_off, say_to_launcher, say_to_person
+from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, InputError, RunBroken
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -41,6 +43,7 @@ def add_roles(commands: Subcommands) -> None:
     add_plan_options(coordinator)
     recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
     add_output_options(recorder, *RECORDING)
+    add_recording_options(recorder)
 
 
 def _role(
@@ -105,12 +108,13 @@ def coordinator_command(options: argparse.Namespace) -> int:
         say({"listening": bus.locators()})
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": summary._asdict()})
-    return EXIT_GOOD
+    return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
 
 
 def recorder_command(options: argparse.Namespace) -> int:
     """`peakmesh recorder GAINS -o FILE`."""
     from agent.contract.keys import RECORDER
+    from agent.contract.recording.parts import files_of
     from agent.network.bus import Bus
     from agent.roles import recorder
 
@@ -118,8 +122,8 @@ def recorder_command(options: argparse.Namespace) -> int:
     run = options.run or gains.problem.name
     path = options.output or default_recording(run)
     with Bus(_network(options), run=run, who=RECORDER) as bus:
-        recorder.run(bus, gains, path=path, force=options.force)
-    print(f"recording  {path}")
+        recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
+    print(f"recording  {' '.join(map(str, files_of(path)))}")
     return EXIT_GOOD
 
 

@@ -14,16 +14,19 @@ from agent.commands.options import (
     add_command,
     add_output_options,
     add_plan_options,
+    add_recording_options,
     default_recording,
     load_gains,
     plan_of,
     positive,
+    recording_plan_of,
 )
 from agent.commands.words import progress, run_text
-from agent.contract.errors import EXIT_GOOD
+from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
+    from agent.plan import RecordingPlan
 
 
 def add_run(commands: Subcommands) -> None:
@@ -31,10 +34,11 @@ def add_run(commands: Subcommands) -> None:
     run = add_command(commands, "run", run_command, "run every role as a process on this machine")
     run.add_argument("gains", type=Path, metavar="GAINS", help="gains file, from peakmesh design")
     add_run_options(run)
+    add_recording_options(run)
 
 
 def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] = RECORDING) -> None:
-    """The options of `run`, but for what to run; `output` is what --output takes, and its help."""
+    """The options of `run`, but for what to run and how to record it; `output` is what --output takes, and its help."""
     add_plan_options(parser)
     add_output_options(parser, *output)
     parser.add_argument(
@@ -46,14 +50,21 @@ def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] 
 def run_command(options: argparse.Namespace) -> int:
     """`peakmesh run GAINS`."""
     gains = load_gains(options.gains)
-    result = run_gains(options.gains, gains, options)
+    result = run_gains(options.gains, gains, options, recording_plan_of(options))
     print(json.dumps(result) if options.json else run_text(result))
-    return EXIT_GOOD
+    return exit_code_of(result)
 
 
-def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str, Any]:
+def exit_code_of(result: dict[str, Any]) -> int:
+    """A run that was not recorded to its end is broken, also where it was allowed to go on."""
+    return EXIT_BROKEN if result["broken_off"] else EXIT_GOOD
+
+
+def run_gains(
+    path: Path, gains: Gains, options: argparse.Namespace, recording_plan: RecordingPlan | None = None
+) -> dict[str, Any]:
     """Run the gains in `path` on this machine; returns the facts of the run."""
-    from agent.contract.recording.writer import refuse_recording
+    from agent.contract.recording.parts import files_of, refuse_recording
     from agent.launch import launch
 
     plan = plan_of(options, gains)
@@ -62,6 +73,15 @@ def run_gains(path: Path, gains: Gains, options: argparse.Namespace) -> dict[str
     refuse_recording(recording, force=options.force)
     with progress(plan.steps) as report:
         summary = launch(
-            path, gains, plan, run=run, recording=recording, force=options.force, wait=options.wait, report=report
+            path,
+            gains,
+            plan,
+            run=run,
+            recording=recording,
+            force=options.force,
+            wait=options.wait,
+            report=report,
+            recording_plan=recording_plan,
         )
-    return {"recording": str(recording), "run": run, "seed": plan.seed, **summary}
+    parts = [str(part) for part in files_of(recording)]
+    return {"recording": str(recording), "parts": parts, "run": run, "seed": plan.seed, **summary}

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 
@@ -25,15 +26,29 @@ def say_to_person(word: dict[str, Any]) -> None:
             print(f"{in_words(who)} is there", file=sys.stderr)
         case {"started": _}:
             print("everybody is there: the run starts", file=sys.stderr)
+        case {"broken_off": sentence}:
+            say_broken_off(sentence)
         case {"summary": summary}:
             print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
+            if summary["broken_off"]:
+                print(f"NOT RECORDED TO THE END: {summary['broken_off']}")
+
+
+def say_broken_off(sentence: object) -> None:
+    """That there is no recording any more, while the run may go on."""
+    print(f"peakmesh: the recording broke off: {sentence}", file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar on stderr, where that is a terminal; the function takes the coordinator's words."""
+
+    def warn(word: dict[str, Any]) -> None:
+        if "broken_off" in word:
+            say_broken_off(word["broken_off"])
+
     if not sys.stderr.isatty():
-        yield lambda word: None
+        yield warn
         return
     from rich.console import Console
     from rich.progress import Progress
@@ -42,6 +57,7 @@ def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
         task = bar.add_task("waiting for everybody", total=steps)
 
         def show(word: dict[str, Any]) -> None:
+            warn(word)
             if "started" in word:
                 bar.update(task, description="steps")
             elif "complete" in word:
@@ -52,10 +68,15 @@ def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
 
 def run_text(result: dict[str, Any]) -> str:
     """The facts of a run, for people."""
-    return (
+    first, *more = result["parts"] or [result["recording"]]
+    path = Path(first)
+    lines = [
         f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
-        f"{result['missing']} missing\n"
-        f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s\n"
-        f"recording  {result['recording']}\n"
-        f"next       peakmesh replay {result['recording']}"
-    )
+        f"{result['missing']} missing",
+        f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s",
+        f"recording  {first}" + (f" and {len(more)} more, to {more[-1]}" if more else ""),
+        f"next       peakmesh replay {first}" + (f" {path.with_suffix('')}.part*{path.suffix}" if more else ""),
+    ]
+    if result["broken_off"]:
+        lines.insert(1, f"NOT RECORDED TO THE END: {result['broken_off']}")
+    return "\n".join(lines)

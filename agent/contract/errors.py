@@ -4,6 +4,7 @@ PeakmeshError
 ├── InputError      2  bad usage or malformed input: a file, a name, a value
 ├── Unattainable    1  the question was well put and the answer is no: infeasible, no certificate
 └── RunBroken       3  a run or a recording broke: a time-out, a lost peer, a cut log
+    ├── RecordingFailed  the recording cannot be written any more
     └── Interrupted 130 or 143: stopped by SIGINT or SIGTERM
 
 A message is one sentence that says what, where, the value, and what would be right.
@@ -45,6 +46,14 @@ class RunBroken(PeakmeshError):
     """A run, or the record of one, that broke."""
 
     exit_code = EXIT_BROKEN
+
+
+class RecordingFailed(RunBroken):
+    """The recording cannot be written any more; `gone`: what was written of the file is gone too."""
+
+    def __init__(self, message: str, *, gone: bool = False) -> None:
+        super().__init__(message)
+        self.gone = gone
 
 
 class Interrupted(RunBroken):

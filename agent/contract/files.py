@@ -25,6 +25,8 @@ def refuse_overwrite(path: Path, *, force: bool) -> None:
     """Raise InputError where `path` exists and `force` was not given, or its folder does not exist."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file in it")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is not a regular file and will not be replaced; give another name")
     if path.exists() and not force:
         raise InputError(f"{path} exists already; give another name, or --force to replace it")
     if not path.parent.is_dir():

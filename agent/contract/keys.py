@@ -20,16 +20,25 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
 
+The recorder writes one more topic to the file, which is never on the wire:
+
+| topic                  | what        | from                       | to                                         |
+|------------------------|-------------|----------------------------|--------------------------------------------|
+| evidence               | Evidence    | recorder                   | whoever checks a recording                 |
+
 The models are in `messages`. Every data message carries an attachment: its number among the sender's messages, the
-sender's clock, the sender's name (`messages.Stamp`). A sensor driver may leave it out.
+sender's clock, the sender's name, a digest of the message (`messages.Stamp`). A sensor driver may leave it out, or
+the digest alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 from pydantic import ValidationError
 
 from agent.contract.errors import RunBroken, first_fault
-from agent.contract.messages import Estimate, Event, Measurement, Message, Mode, PlantState
+from agent.contract.messages import Estimate, Event, Evidence, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
 
 
@@ -43,7 +52,7 @@ def topic_of(key_expression: str) -> str:
 
 
 # data
-MODE, PLANT_STATE, EVENT = "mode", "plant/state", "event"
+MODE, PLANT_STATE, EVENT, EVIDENCE = "mode", "plant/state", "event", "evidence"
 
 
 def measurement(node: str) -> str:
@@ -67,6 +76,8 @@ def model_of(topic: str) -> type[Message] | None:
             return Estimate
         case ["event"]:
             return Event
+        case ["evidence"]:
+            return Evidence
     return None
 
 
@@ -107,6 +118,18 @@ def node_who(node: str) -> str:
 
 def sensor_who(node: str) -> str:
     return f"sensor-{node}"
+
+
+def sender_of(topic: str, *, external: Container[str] = ()) -> str:
+    """Who numbers the messages of a topic; the nodes in `external` are measured by sensors."""
+    match topic.split("/"):
+        case ["node", name, "estimate"]:
+            return node_who(name)
+        case ["node", name, "measurement"] if name in external:
+            return sensor_who(name)
+        case ["mode"] | ["event"]:
+            return COORDINATOR
+    return PLANT
 
 
 def participants(problem: Problem) -> list[str]:

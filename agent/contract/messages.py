@@ -5,6 +5,7 @@ Data messages are flat JSON objects with a `step`; what is on the wire is what i
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from typing import Literal, NamedTuple, Self
 
@@ -74,6 +75,20 @@ class Event(Message):
     detail: str
 
 
+class Evidence(Message):
+    """What sender `who` says of its messages from number `first` on: the recorder's, beside the messages themselves.
+
+    `digests` has eight hexadecimal digits for each, the first four bytes of the sender's digest, or "--------" where
+    there is none. `head` is the head of the sender's chain after the last of them, in hexadecimal; `step` is the last
+    step among them. Heads and digests: see agent.contract.recording.evidence.
+    """
+
+    who: str
+    first: int = Field(ge=0)
+    digests: str = Field(pattern=r"^([0-9a-f]{8}|-{8})+$")
+    head: str = Field(pattern=r"^[0-9a-f]{32}$")
+
+
 class Ready(Frozen):
     """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains."""
 
@@ -97,12 +112,26 @@ class Control(Frozen):
     reason: str
 
 
+class BrokenOff(Frozen):
+    """The recording could not be written any more, because `reason`; it holds every step < `steps`.
+
+    `stop`: the run is to end for that; otherwise it goes on without a recording.
+    """
+
+    reason: str
+    steps: int
+    stop: bool
+
+    def __str__(self) -> str:
+        return f"{self.reason}; there is no recording from step {self.steps} on"
+
+
 class Acknowledged(Frozen):
-    """The recorder's word: it holds the first `received[who]` messages of everyone, and every step < `steps`.
+    """The recorder's word: it has the first `received[who]` messages of everyone, and every step < `steps`.
 
     `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of
-    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name;
-    everybody may go.
+    theirs, `lacking` the topics that keep step `steps` incomplete. `closed`: the recording is whole and has its name,
+    or is `broken_off`; everybody may go.
     """
 
     steps: int
@@ -112,17 +141,24 @@ class Acknowledged(Frozen):
     reached: dict[str, int]
     lacking: list[str]
     closed: bool
+    broken_off: BrokenOff | None = None
 
 
 class Stamp(NamedTuple):
-    """The attachment of a data message: `number` counts the sender's messages from 0, `time` is in ns."""
+    """The attachment of a data message: `number` counts the sender's messages from 0, `time` is in ns.
+
+    `digest` is `digest_of` the message, or b"" where the sender gives none.
+    """
 
     number: int
     time: int
     sender: str
+    digest: bytes = b""
 
     def encode(self) -> bytes:
-        return _STAMP.pack(self.number, self.time) + self.sender.encode()
+        """Number and time, the sender's name, and after a zero byte the digest."""
+        name = self.sender.encode()
+        return _STAMP.pack(self.number, self.time) + (name + b"\0" + self.digest if self.digest else name)
 
     @classmethod
     def decode(cls, attachment: bytes) -> Self:
@@ -130,7 +166,16 @@ class Stamp(NamedTuple):
         if len(attachment) <= _STAMP.size:
             raise ValueError(f"a stamp is longer than {_STAMP.size} bytes, this one has {len(attachment)}")
         number, time = _STAMP.unpack_from(attachment)
-        return cls(number, time, attachment[_STAMP.size :].decode())
+        name, zero, digest = attachment[_STAMP.size :].partition(b"\0")
+        if len(digest) != (DIGEST_SIZE if zero else 0):
+            raise ValueError(f"a digest has {DIGEST_SIZE} bytes, this one has {len(digest)}")
+        return cls(number, time, name.decode(), digest)
 
 
 _STAMP = struct.Struct("<QQ")
+DIGEST_SIZE = 16  # bytes
+
+
+def digest_of(topic: str, payload: bytes) -> bytes:
+    """What a sender says of its message, so that nobody can change it later unnoticed: BLAKE2b, 16 bytes."""
+    return hashlib.blake2b(topic.encode() + b"\0" + payload, digest_size=DIGEST_SIZE).digest()

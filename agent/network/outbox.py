@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from agent.contract.messages import Stamp
+from agent.contract.messages import Stamp, digest_of
 
 
 class Sent(NamedTuple):
@@ -30,8 +30,9 @@ class Outbox:
         return len(self._kept)
 
     def add(self, topic: str, payload: bytes) -> Sent:
-        """Number a message and keep it."""
-        sent = Sent(topic, payload, Stamp(self._number, time.time_ns(), self._who))
+        """Number a message, say what is in it, and keep it."""
+        stamp = Stamp(self._number, time.time_ns(), self._who, digest_of(topic, payload))
+        sent = Sent(topic, payload, stamp)
         self._number += 1
         self._kept.append(sent)
         return sent

@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from agent.contract.errors import InputError, PeakmeshError, RunBroken
+from agent.contract.errors import InputError, PeakmeshError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import EVENT, MODE, in_words, participants, sensor_who
-from agent.contract.messages import Acknowledged, Control, Event, Mode
+from agent.contract.keys import COORDINATOR, EVENT, MODE, RECORDER, in_words, participants, sensor_who
+from agent.contract.messages import Acknowledged, BrokenOff, Control, Event, Mode
 from agent.contract.schedule import modes
 from agent.network.bus import Bus
 from agent.network.words import Peer
@@ -30,9 +30,12 @@ class Summary(NamedTuple):
     rounds_per_second: float  # from step 0 to the recorder's acknowledgement of the last step
     messages: int  # recorded
     missing: int
+    recorded_steps: int  # all, unless the recording broke off
+    broken_off: str  # why, and since when there is no recording; "" where there is a whole one
 
 
-Word = dict[str, Any]  # what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}
+# what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}, {"broken_off": sentence}
+Word = dict[str, Any]
 
 
 class Lost(RunBroken):
@@ -46,8 +49,8 @@ class Lost(RunBroken):
 def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -> Summary:
     """Run the whole of `plan`.
 
-    Raises RunBroken where somebody was lost or a deadline has passed, Interrupted on a signal; in both cases the
-    others have been told, and the recorder has closed the recording.
+    Raises RunBroken where somebody was lost, a deadline has passed or the recorder has the run stop, Interrupted on a
+    signal; in all cases the others have been told, and the recorder has closed the recording.
     """
     bus.advertise([MODE, EVENT])
     conductor = Conductor(bus, gains, plan, report)
@@ -66,7 +69,15 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
             raise RunBroken(f"{error}; {conductor.complete} steps were complete") from None
         raise
     last_word = conductor.close()
-    return Summary(plan.steps, plan.steps / seconds, last_word.messages, last_word.missing)
+    off = last_word.broken_off
+    return Summary(
+        steps=plan.steps,
+        rounds_per_second=plan.steps / seconds,
+        messages=last_word.messages,
+        missing=last_word.missing,
+        recorded_steps=plan.steps if off is None else off.steps,
+        broken_off="" if off is None else str(off),
+    )
 
 
 class Conductor:
@@ -76,7 +87,8 @@ class Conductor:
         self._bus, self._gains, self._plan, self._report = bus, gains, plan, report
         self._reported = 0.0
         self._everybody = [who for who in participants(gains.problem) if who != bus.who]
-        self.complete = 0  # steps that the recorder holds
+        self.complete = 0  # steps that the recorder has
+        self._broken_off: BrokenOff | None = None
         self._lacking: list[str] = []
         self._started = False
 
@@ -139,8 +151,8 @@ class Conductor:
             )
         )
 
-    def _announce(self, kind: str, detail: str) -> None:
-        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=self._bus.who, detail=detail))
+    def _announce(self, kind: str, detail: str, *, who: str = COORDINATOR) -> None:
+        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=who, detail=detail))
 
     def _wait_for_progress(self) -> None:
         """Until the recorder holds one more step, the deadline passes, or somebody is lost.
@@ -154,14 +166,25 @@ class Conductor:
             if left <= 0.0:
                 raise RunBroken(self._what_is_late(silent))
             match self._bus.receive(timeout=left):
-                case Acknowledged(steps=steps, lacking=lacking):
-                    self.complete, self._lacking = steps, lacking
+                case Acknowledged() as acknowledged:
+                    self.complete, self._lacking = acknowledged.steps, acknowledged.lacking
                     silent = False
+                    self._heed(acknowledged.broken_off)
                 case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who)
         if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._report({"complete": self.complete})
+
+    def _heed(self, broken_off: BrokenOff | None) -> None:
+        """What the recorder says of its recording: stop where it asks for that, else tell everybody, once."""
+        if broken_off is None or broken_off == self._broken_off:
+            return
+        self._broken_off = broken_off
+        if broken_off.stop:
+            raise RecordingFailed(str(broken_off))
+        self._announce("unrecorded", str(broken_off), who=RECORDER)
+        self._report({"broken_off": str(broken_off)})
 
     def _takes_part(self, who: str) -> bool:
         return who in self._everybody or who in map(sensor_who, self._plan.external)

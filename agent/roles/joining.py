@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from agent.contract.errors import RunBroken
+from agent.contract.errors import RecordingFailed, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import participants
 from agent.contract.messages import Control
@@ -29,7 +29,7 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
     """Join, do `work` in a thread of its own until the coordinator ends the run, stay until all is recorded.
 
     Meanwhile the main thread answers replays and watches for the end. Raises RunBroken where the run was stopped
-    or may lack something, and whatever `work` raises.
+    or its recording may lack something, and whatever `work` raises.
     """
     start = join(bus, gains)
 
@@ -51,3 +51,5 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
             raise RunBroken(closed.control.reason) from None
         if last_word is None:
             raise RunBroken("the recorder did not say that the recording is closed; it may lack messages") from None
+        if last_word.broken_off is not None:
+            raise RecordingFailed(f"the run has ended, but {last_word.broken_off}") from None

@@ -1,39 +1,52 @@
-"""The recorder: writes every message to MCAP, says what it holds, and closes the recording before anybody leaves."""
+"""The recorder: writes every message to MCAP, says what it holds, and closes the recording before anybody leaves.
+
+Where the recording breaks off, because the disk is full or the file was taken away, the recorder says so at once and
+stays: it goes on taking messages and acknowledging them, so that publishers need not keep what will never be
+recorded, until the coordinator ends the run, now or when all steps are done.
+"""
 
 from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from agent.contract.errors import Interrupted, RunBroken
+from agent.contract.errors import Interrupted, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, MODE, PLANT, PLANT_STATE, decode, estimate, measurement, node_who
-from agent.contract.messages import Acknowledged, Control
-from agent.contract.recording import Logged
-from agent.contract.recording.writer import RecordingWriter, refuse_recording
+from agent.contract.keys import EVENT, MODE, PLANT_STATE, decode, estimate, measurement, sender_of
+from agent.contract.messages import Acknowledged, BrokenOff, Control
+from agent.contract.recording.parts import refuse_recording
+from agent.contract.recording.writer import Split
 from agent.network.bus import Bus
 from agent.network.session import Channel
 from agent.network.words import RunClosed, Sample
-from agent.receipts import Receipts
+from agent.plan import RecordingPlan
 from agent.roles.joining import join
+from agent.roles.record import Record
 
 SHORTEST_PAUSE = 0.002  # s, while messages come; they wait in their channels meanwhile
 LONGEST_PAUSE = 0.02  # s, while none do
 IDLE_SECONDS = 0.5  # silence after which it says what it lacks
 
 
-def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
-    """Take part as the recorder until the run has ended; raises RunBroken where it did not end well."""
+def run(
+    bus: Bus, gains: Gains, *, path: Path, force: bool, plan: RecordingPlan, report: Callable[[BrokenOff], None]
+) -> None:
+    """Take part as the recorder until the run has ended; raises RunBroken where it did not end well.
+
+    Where the recording breaks off `report` is told at once, and so is everybody else.
+    """
     refuse_recording(path, force=force)
     names = gains.problem.node_names
     topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
-    channels = [bus.channel(topic) for topic in topics]
+    channels = {topic: bus.channel(topic) for topic in topics}
     start = join(bus, gains)
-    with RecordingWriter(path, run=_facts(bus.run, gains, start), gains=gains, force=force) as writer:
-        recorder = Recorder(bus, channels, gains, writer, window=start.window)
+    split = Split(plan.split_size, plan.split_seconds)
+    with Record(path, run=_facts(bus.run, gains, start), gains=gains, force=force, split=split) as record:
+        recorder = Recorder(bus, channels, record, window=start.window, goes_on=plan.goes_on, report=report)
         try:
             recorder.record()
         except RunClosed as closed:
@@ -41,103 +54,117 @@ def run(bus: Bus, gains: Gains, *, path: Path, force: bool) -> None:
             recorder.close(status="stopped" if stopped else "finished", reason=closed.control.reason)
             if stopped:
                 raise RunBroken(closed.control.reason) from None
+            if recorder.broken_off is not None:
+                raise RecordingFailed(f"the run has ended, but {recorder.broken_off}") from None
         except (RunBroken, Interrupted) as error:
             recorder.close(status="broken", reason=str(error))
             raise
 
 
 class Recorder:
-    """The open recording, and the receipts for what is in it."""
+    """Takes what comes into the record, and tells everybody what it has."""
 
     def __init__(
-        self, bus: Bus, channels: list[Channel], gains: Gains, writer: RecordingWriter, *, window: int
+        self,
+        bus: Bus,
+        channels: Mapping[str, Channel],
+        record: Record,
+        *,
+        window: int,
+        goes_on: bool,
+        report: Callable[[BrokenOff], None],
     ) -> None:
-        self._bus, self._channels, self._writer = bus, channels, writer
-        self._publishers = [COORDINATOR, PLANT, *map(node_who, gains.problem.node_names)]
-        self._receipts = Receipts(gains.problem)
+        self._bus, self._channels, self._record = bus, channels, record
+        self._goes_on, self._report = goes_on, report
+        self._publishers = sorted({sender_of(topic) for topic in channels})
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._acknowledged = 0
         self._closing = False
         self._quiet_since = time.monotonic()
+        self.broken_off: BrokenOff | None = None
 
     def record(self) -> None:
         """Until Bus.receive raises: the run is closed, the coordinator lost, or a signal came."""
         pause = SHORTEST_PAUSE
         while True:
+            self._record.keep_up()
+            self._heed_failure()
             word = self._bus.receive(timeout=pause)
             if isinstance(word, Sample):  # a replay that we asked for
-                self._write(word)
-            pause = SHORTEST_PAUSE if self._write_waiting() else min(2.0 * pause, LONGEST_PAUSE)
-            self._writer.flush_when_due()
+                self._take(word)
+            pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
-
-    def _write_waiting(self) -> bool:
-        """Write what has come, acknowledging on the way; False where there was nothing."""
-        before = self._receipts.messages
-        for channel in self._channels:
-            for sample in channel.waiting():
-                self._write(sample)
-        new_steps, new_messages = self._receipts.complete - self._acknowledged, self._receipts.messages - before
-        if new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
-            self._acknowledge()
-        return new_messages > 0
 
     def close(self, *, status: str, reason: str) -> None:
         """Ask everybody for what is missing, end the file, and let everybody go."""
         self._closing = True
-        self._write_waiting()
+        self._take_waiting()
         self._ask_everybody()
         for sample in self._bus.replayed(self._publishers):
-            self._write(sample)
-        self._write_waiting()  # what came meanwhile
-        receipts = self._receipts
-        end = {"status": status, "reason": reason, "steps": str(receipts.complete)}
-        for who in sorted(receipts.reached):
-            end[f"received.{who}"] = str(receipts.received.get(who, 0))
-            end[f"reached.{who}"] = str(receipts.reached[who])
-            end[f"missing.{who}"] = str(receipts.missing(who))  # before the last that is there
-        self._writer.finish(end)
+            self._take(sample)
+        self._take_waiting()  # what came meanwhile
+        self._record.finish(status=status, reason=reason)
+        self._heed_failure()
         self._acknowledge(closed=True)
         self._bus.wait_until_gone(self._publishers)
 
-    def _write(self, sample: Sample) -> None:
+    def _take_waiting(self) -> bool:
+        """Take what has come, acknowledging on the way; False where there was nothing."""
+        receipts = self._record.receipts
+        before = receipts.messages
+        for channel in self._channels.values():
+            for sample in channel.waiting():
+                self._take(sample)
+        new_steps, new_messages = receipts.complete - self._acknowledged, receipts.messages - before
+        if new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
+            self._acknowledge()
+        return new_messages > 0
+
+    def _take(self, sample: Sample) -> None:
         try:
+            if sample.topic not in self._channels:  # the answer to a replay can say anything
+                raise RunBroken(f"there is no topic {sample.topic}")
             step = decode(sample.topic, sample.payload).step
         except RunBroken:
             if self._closing:  # no foreign message shall keep the file from being closed
                 return
             raise
-        if not self._receipts.take(sample.topic, step, sample.stamp):
-            return
-        now = time.time_ns()
-        number, published = sample.stamp[:2] if sample.stamp is not None else (0, now)
-        self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
-        self._quiet_since = time.monotonic()
+        if self._record.take(sample, step):
+            self._quiet_since = time.monotonic()
+
+    def _heed_failure(self) -> None:
+        """Tell everybody, once, that nothing can be recorded any more."""
+        record = self._record
+        if record.failure and self.broken_off is None:
+            self.broken_off = BrokenOff(reason=record.failure, steps=record.held.steps, stop=not self._goes_on)
+            self._report(self.broken_off)
+            self._acknowledge()
 
     def _complain(self) -> None:
         """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
         self._ask_everybody()
-        self._acknowledge(lacking=self._receipts.lacking())
+        self._acknowledge(lacking=self._record.receipts.lacking())
         self._quiet_since = time.monotonic()
 
     def _ask_everybody(self) -> None:
         """For the messages that we do not hold; they come as samples."""
         for who in self._publishers:
-            self._bus.request_replay(who, first=self._receipts.received.get(who, 0))
+            self._bus.request_replay(who, first=self._record.receipts.received.get(who, 0))
 
     def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False) -> None:
-        receipts = self._receipts
+        receipts = self._record.receipts
         self._acknowledged = receipts.complete
         self._bus.acknowledge(
             Acknowledged(
                 steps=receipts.complete,
-                messages=receipts.messages,
+                messages=self._record.held.messages if self.broken_off is not None else receipts.messages,
                 missing=sum(map(receipts.missing, receipts.reached)),
                 received=receipts.received,
                 reached=receipts.reached,
                 lacking=lacking or [],
                 closed=closed,
+                broken_off=self.broken_off,
             )
         )
 

@@ -9,9 +9,15 @@ from datetime import datetime
 from pathlib import Path
 
 import agent.commands.run
-from agent.commands.options import Subcommands, add_command, default_recording
+from agent.commands.options import (
+    Subcommands,
+    add_command,
+    add_recording_options,
+    default_recording,
+    recording_plan_of,
+)
 from agent.commands.words import run_text
-from agent.contract.errors import EXIT_GOOD, InputError
+from agent.contract.errors import InputError, RecordingFailed
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
 from designer.commands.design import add_method, design_and_save, design_text
@@ -44,6 +50,8 @@ def demo_command(options: argparse.Namespace) -> int:
     gains, designed = design_and_save(problem, options.method, gains_path, force=options.force)
     _say(options, f"1. design\n{design_text(designed)}")
     ran = agent.commands.run.run_gains(gains_path, gains, options)
+    if ran["broken_off"]:
+        raise RecordingFailed(ran["broken_off"])
     _say(options, f"\n2. run: {gains.problem.n + 3} processes\n{run_text(ran)}")
     account = Account.of(options.output)
     _say(options, f"\n3. replay\n{account.verdict.text()}")
@@ -67,6 +75,7 @@ def add_run(commands: Subcommands) -> None:
     run.add_argument("gains", metavar="PROBLEM_OR_GAINS", help=f"gains file, {PROBLEM}")
     add_method(run)
     agent.commands.run.add_run_options(run)
+    add_recording_options(run)
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -77,16 +86,17 @@ def run_command(options: argparse.Namespace) -> int:
             raise InputError(f"--method says how to design a problem; {path} has its gains already")
         options.gains = path
         return agent.commands.run.run_command(options)
+    from agent.contract.recording.parts import refuse_recording
     from designer.ladder import rounded_up
     from designer.problems import find
 
     problem = find(options.gains)
     if options.output is None:
         options.output = default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
-    refuse_overwrite(options.output, force=options.force)
+    refuse_recording(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
     gains, _ = design_and_save(problem, options.method, path, force=options.force)
     print(f"designed {path}, gamma = {rounded_up(gains.certificate.gamma)}", file=sys.stderr)
-    result = {"gains": str(path), **agent.commands.run.run_gains(path, gains, options)}
-    print(json.dumps(result) if options.json else f"{run_text(result)}\ngains      {path}")
-    return EXIT_GOOD
+    ran = agent.commands.run.run_gains(path, gains, options, recording_plan_of(options))
+    print(json.dumps({"gains": str(path), **ran}) if options.json else f"{run_text(ran)}\ngains      {path}")
+    return agent.commands.run.exit_code_of(ran)

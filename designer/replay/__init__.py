@@ -5,7 +5,7 @@
 2. one step of (10) from the *logged* state, with the messages that each node says it used, gives the next logged
    errors: names step, node, field, size;
 3. (10) running *freely* from step 0 stays with the log;
-4. every message is there exactly once;
+4. every message is there exactly once, and is what its sender says it sent;
 5. the realised run obeys its path inequality.
 
 Beside these, the certificate of the attached gains is checked again: it decides nothing about the log, but without
@@ -266,6 +266,7 @@ def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> V
         duplicates=log.census.duplicates,
         strange=log.census.strange,
         numbering=log.census.numbering,
+        evidence=log.evidence,
         peak=_peak(log),
         energy=audit[1] if audit else None,
         gamma=checked_gamma(log.gains),
@@ -291,8 +292,11 @@ def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
 def _census_proof(log: Log) -> Proof:
     """What a filtered or cut file lacks is held against it no more than it shows anything."""
     census = log.census
-    faulty = bool(census.missing.total or census.duplicates.total or census.strange or census.numbering)
+    altered = log.evidence.total
+    faulty = bool(census.missing.total or census.duplicates.total or census.strange or census.numbering or altered)
     counts = [f"{census.missing.total} missing", f"{census.duplicates.total} double"]
+    if altered or log.evidence.checked:
+        counts.append(f"{altered} altered")
     if census.lacking.total:
         steps = f" from step {census.lacking.first[0].step} on" if census.lacking.first else ""
         counts.append(f"{census.lacking.total} not in this file{steps}")

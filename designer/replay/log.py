@@ -18,15 +18,15 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, PLANT, PLANT_STATE, measurement
+from agent.contract.keys import COORDINATOR, EVENT, EVIDENCE, PLANT, PLANT_STATE, measurement
 from agent.contract.messages import Event
 from agent.contract.recording import Logged
+from agent.contract.recording.evidence.examiner import Examiner, Findings
 from agent.contract.recording.reader import Progress, RecordingReader
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.part import Part
 from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
-EVIDENCE = "evidence"  # the recorder's own topic: what senders say of their messages
 _NAMED = 3  # so many damages and topics are named
 _LARGEST = 1 << 33  # bytes of the arrays that hardly any message fills
 
@@ -49,6 +49,7 @@ class Log:
     steps: int  # rows of the arrays
     messages: int
     census: Census
+    evidence: Findings  # whether the messages are those that were sent
     external: tuple[bool, ...]  # per node: a real sensor gives its measurements
     modes: Words  # what the numbers in `mode` and `used` mean; those of the problem come first
     senders: Senders  # what the numbers in `heard` mean
@@ -131,6 +132,7 @@ def _log(
         strange.append(f"the end, it says that the run finished after {expected} of {planned} steps")
     steps = min(last + 1, expected)
     _refuse_hollow(columns, steps, content.messages, path=reader.path)
+    evidence = content.examiner.finish(end)
     census = take_census(
         topics.values(),
         columns,
@@ -148,7 +150,7 @@ def _log(
         end=reader.end,
         damage=_joined(damages),
         is_doubtful=reader.is_doubtful,
-        notes=(*reader.notes, *_strangers(reader, content.others), *census.notes),
+        notes=(*reader.notes, *_strangers(reader, content.others), *census.notes, *evidence.unchecked),
         finished=finished,
         gains=reader.gains,
         seed=seed,
@@ -156,6 +158,7 @@ def _log(
         steps=steps,
         messages=content.messages - census.copies,
         census=census,
+        evidence=part.of(evidence),
         external=external,
         modes=content.modes,
         senders=content.senders,
@@ -197,6 +200,8 @@ class _Content:
         self.modes, self.senders = Words(gains.problem.mode_names), Senders(gains.problem.node_names)
         self.topics, self.columns = topics_of(gains.problem, external, planned=planned)
         self.messages = 0
+        names = gains.problem.node_names
+        self.examiner = Examiner(external=[name for name, real in zip(names, external, strict=True) if real])
         self._planned = planned
         self._unreadable = Sentences()
         self.others: Counter[str] = Counter()  # topics that this problem does not have
@@ -209,26 +214,31 @@ class _Content:
             topic = topics.get(logged.topic)
             if topic is not None:
                 self.messages += 1
-                topic.add(logged, columns, planned=planned, modes=modes, senders=senders)
+                step = topic.add(logged, columns, planned=planned, modes=modes, senders=senders)
+                self.examiner.take(logged, step)
             elif logged.topic == EVENT:
                 self.messages += 1
-                self._event(logged)
-            elif logged.topic != EVIDENCE:
+                self.examiner.take(logged, self._event(logged))
+            elif logged.topic == EVIDENCE:
+                self.examiner.take(logged, -1)
+            else:
                 self.others[logged.topic] += 1
         for topic in topics.values():
             topic.settle(columns)
 
-    def _event(self, logged: Logged) -> None:
+    def _event(self, logged: Logged) -> int:
+        """The step of an event, -1 where it is none."""
         try:
             event = Event.decode(logged.payload)
         except ValidationError as error:
             words = error.errors(include_url=False)[0]["msg"].lower()
             self._unreadable.add(f"{EVENT}, number {logged.number}: {words}")
-            return
+            return -1
         if event.who == COORDINATOR:
             self._kinds.add(event.kind)
         self._events.append(logged.number)
         self._keys.append(hash((logged.publish_time, logged.payload)))
+        return event.step
 
     def last(self) -> int:
         """The last step of which there is anything, -1 where there is nothing."""

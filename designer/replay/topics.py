@@ -154,18 +154,18 @@ class Topic:
         self._values = {name: array("d") for name in self.places}
         self._texts = {name: array("q") for name in self.words}
 
-    def add(self, logged: Logged, columns: Columns, *, planned: int, modes: Words, senders: Senders) -> None:
-        """Take in a message."""
+    def add(self, logged: Logged, columns: Columns, *, planned: int, modes: Words, senders: Senders) -> int:
+        """Take in a message; returns its step, -1 where it cannot be read."""
         try:
             message = self._model.decode(logged.payload)
         except ValidationError as error:
             words = error.errors(include_url=False)[0]["msg"].lower()
             self.unreadable.add(f"{self.topic}, number {logged.number}: {words}")
-            return
+            return -1
         fault = self._fault(message, planned)
         if fault:
             self.faults.add(f"{self.topic}, step {message.step}: {fault}")
-            return
+            return message.step
         self._steps.append(message.step)
         self._numbers.append(logged.number)
         self._times.append(logged.log_time)
@@ -178,6 +178,7 @@ class Topic:
             self._texts["heard"].append(senders.number(message.heard))
         if len(self._steps) == _AT_ONCE:
             self.settle(columns)
+        return message.step
 
     def _fault(self, message: Message, planned: int) -> str:
         if message.step >= planned:

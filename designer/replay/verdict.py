@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
+from agent.contract.recording.evidence.examiner import Findings
 from designer.replay.census import Faults
 from designer.replay.gamma import Gamma
 from designer.replay.part import Part
@@ -147,6 +148,7 @@ class Verdict:
     copies: int  # of equal content
     strange: tuple[str, ...]  # what should not be in the file
     numbering: tuple[str, ...]  # faults in the senders' numbering
+    evidence: Findings  # whether the messages are those that were sent
     peak: Peak | None  # against the simulated plant, also where sensors measured something else
     energy: float | None  # sum of |w|^2
     gamma: Gamma
@@ -209,6 +211,9 @@ class Verdict:
             "duplicates_first": [place._asdict() for place in self.duplicates.first],
             "strange": list(self.strange),
             "numbering": list(self.numbering),
+            "altered": self.evidence.total,
+            "altered_first": [finding._asdict() for finding in self.evidence.wrong],
+            "as_sent": self.evidence.checked,
             "simulated": self.is_simulated,
             "real_sensors": bool(self.external),
             "external": list(self.external),
@@ -238,14 +243,15 @@ class Verdict:
 
     def _what_is_wrong(self) -> str:
         """The faults of proof 4 in a few words."""
-        missing, double = self.missing.total, self.duplicates.total
+        missing, double, altered = self.missing.total, self.duplicates.total, self.evidence.total
         found = [
             f"{counted(missing, 'message')} {'is' if missing == 1 else 'are'} missing",
             f"{counted(double, 'message')} contradict{'s' if double == 1 else ''} another of the same step",
             "something in it is not of this run, or was altered",
             "the senders' numbers have faults",
+            f"{counted(altered, 'message')} {'is' if altered == 1 else 'are'} not what the senders say they sent",
         ]
-        faults = (missing, double, self.strange, self.numbering)
+        faults = (missing, double, self.strange, self.numbering, altered)
         return ", and ".join(words for words, fault in zip(found, faults, strict=True) if fault)
 
     def _head(self) -> list[str]:
@@ -294,6 +300,10 @@ class Verdict:
                 lines.append(f"{word}: {faults.total} ({named}{more})")
         for fault in (*self.strange, *self.numbering)[:5]:
             lines.append(f"strange: {fault}")
+        for finding in self.evidence.wrong[:5]:
+            lines.append(f"not as sent: {finding}")
+        if self.evidence.total > 5:
+            lines.append(f"not as sent: {self.evidence.total - 5} more")
         return lines
 
     def _peak(self) -> list[str]:

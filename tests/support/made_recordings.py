@@ -6,7 +6,7 @@ Seen losses, lossy links and unbiased gains too. A run may hold misdeeds, for re
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,8 +15,10 @@ import numpy as np
 from agent.contract import keys, schedule
 from agent.contract.files import canonical
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
+from agent.contract.messages import Evidence, Stamp, digest_of
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
+from agent.contract.recording.evidence.chains import Chains
 from agent.contract.recording.writer import RecordingWriter
 
 
@@ -278,23 +280,39 @@ def record(
     status: str = "finished",
     end_steps: int | None = None,
     received: Mapping[str, int] | None = None,
+    evidence: bool = True,
     **facts: str,
 ) -> Path:
     """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`.
+
+    With `evidence` of them, for the first message of every number, as if these had been sent.
 
     `received` counts each sender's messages, as the recorder does; where it is not given, those of a whole run, and
     of one without a plant where nothing of it is there and no node needs it.
     """
     run = {"run": "test", "seed": str(seed), "steps": str(steps), "gains": gains.digest(), "external": "", **facts}
+    chains, numbers = Chains(), set[tuple[str, int]]()
     with RecordingWriter(path, run=run, gains=gains) as writer:
+
+        def put(blocks: Iterable[Evidence | None], time: int) -> None:
+            for block in blocks:
+                if block is not None and evidence:
+                    writer.add(Logged(keys.EVIDENCE, block.encode(), 0, time, time))
+
         for time, message in enumerate(sent):
             payload = canonical(message.document)
             writer.add(Logged(message.topic, payload, message.number, time, time))
+            if (message.who, message.number) not in numbers:
+                numbers.add((message.who, message.number))
+                stamp = Stamp(message.number, time, message.who, digest_of(message.topic, payload))
+                put([chains.add(stamp, message.document["step"])], time)
         if whole:
+            put(chains.rest(last=True), len(sent))
             external = facts.get("external", "")
             counts = whole_run(gains.problem, steps, external) if received is None else dict(received)
             if received is None and len(external.split(",")) == gains.problem.n:
                 counts = {who: count for who, count in counts.items() if any(message.who == who for message in sent)}
             end = {"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)}
-            writer.finish(end | {f"received.{who}": str(count) for who, count in counts.items()})
+            heads = {f"head.{who}": head for who, head in chains.heads().items() if evidence}
+            writer.finish(end | {f"received.{who}": str(count) for who, count in counts.items()} | heads)
     return path if whole else path.with_name(path.name + ".part")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.contract.gains import Gains
-from agent.contract.keys import model_of
+from agent.contract.keys import EVIDENCE, model_of
 from agent.contract.messages import Message
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
@@ -91,9 +91,9 @@ def _runs(pid: int) -> bool:
 
 
 def logged(path: Path) -> list[Logged]:
-    """All messages of a recording, as far as it goes."""
+    """All messages of a recording that were on the wire, as far as it goes."""
     with RecordingReader(path) as reader:
-        return list(reader.messages())
+        return [message for message in reader.messages() if message.topic != EVIDENCE]
 
 
 def end_of(path: Path) -> dict[str, str] | None:

@@ -4,7 +4,8 @@ Metadata `run` comes first and `end` last; problem.json, gains.json and a Foxglo
 without `end` was cut. Messages are the wire's own bytes; log_time is the recorder's clock, publish_time the
 sender's, sequence the sender's own numbering. Order by step and sender, never by time.
 
-`writer` writes a run, `reader` reads one; only this folder imports mcap.
+`writer` writes a run, whole or in `parts`, `reader` reads one; `evidence` tells whether its messages are those that
+were sent. Only this folder imports mcap.
 """
 
 from __future__ import annotations

@@ -15,12 +15,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, Self
 
-from agent.contract.keys import EVENT, MODE, PLANT_STATE, model_of
+from agent.contract.keys import EVENT, EVIDENCE, MODE, PLANT_STATE, model_of
 from agent.contract.recording import Logged
+from agent.contract.recording.parts import refuse_recording, unfinished
 from agent.contract.recording.reader import Progress, RecordingReader
-from agent.contract.recording.writer import RecordingWriter, refuse_recording
+from agent.contract.recording.writer import RecordingWriter
 
-EVIDENCE = "evidence"
 _STEP = re.compile(rb'"step"\s*:\s*(\d{1,18})\b')
 _ORDER = {EVENT: 0, MODE: 1, PLANT_STATE: 2, EVIDENCE: 4}  # of the topics within a step
 _BETWEEN = 3  # all others, by name
@@ -66,7 +66,7 @@ def recover(
                 end = reader.end or _end(reader, steps.complete)
                 writer.finish(end)
         except BaseException:
-            output.with_name(output.name + ".part").unlink(missing_ok=True)
+            unfinished(output).unlink(missing_ok=True)
             raise
         return Recovered(
             messages=sorter.given,

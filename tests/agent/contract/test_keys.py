@@ -16,6 +16,7 @@ from agent.contract.keys import (
     CONTROL,
     COORDINATOR,
     EVENT,
+    EVIDENCE,
     MODE,
     PLANT,
     PLANT_STATE,
@@ -30,6 +31,7 @@ from agent.contract.keys import (
     participants,
     ready,
     replay,
+    sender_of,
     sensor_who,
     topic_of,
 )
@@ -65,6 +67,14 @@ def test_participants_are_named_in_words(node: str) -> None:
     assert [in_words(who) for who in (COORDINATOR, PLANT, RECORDER)] == ["the coordinator", "the plant", "the recorder"]
 
 
+@given(NAMES)
+def test_every_topic_has_a_sender(name: str) -> None:
+    assert sender_of(estimate(name), external=(name,)) == node_who(name)
+    assert sender_of(measurement(name)) == sender_of(PLANT_STATE) == PLANT
+    assert sender_of(measurement(name), external=(name,)) == sensor_who(name)
+    assert sender_of(MODE) == sender_of(EVENT) == COORDINATOR
+
+
 def test_everybody_takes_part_once(gains: Gains) -> None:
     everybody = participants(gains.problem)
     assert everybody == ["coordinator", "plant", "recorder", "node-n0", "node-n1", "node-n2"]
@@ -74,9 +84,8 @@ def test_the_table_names_every_key_of_the_code() -> None:
     """The docstring's tables have one row for each topic and each key, under the model the code gives it."""
     rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in re.findall(r"^\|.*\|$", keys.__doc__, re.M)]
     table = dict(row for row in rows if not row[0].startswith("-") and row[0] != "topic")
-    topics = {
-        topic: model_of(topic).__name__ for topic in (MODE, PLANT_STATE, EVENT, measurement("<n>"), estimate("<n>"))
-    }
+    data = (MODE, PLANT_STATE, EVENT, EVIDENCE, measurement("<n>"), estimate("<n>"))
+    topics = {topic: model_of(topic).__name__ for topic in data}
     others = {
         alive("<who>"): "liveliness",
         ready("<who>"): "Ready",

@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from agent.contract.keys import node_who
-from agent.contract.messages import Estimate, Event, Measurement, Message, Mode, PlantState, Stamp
+from agent.contract.messages import (
+    DIGEST_SIZE,
+    Estimate,
+    Event,
+    Measurement,
+    Message,
+    Mode,
+    PlantState,
+    Stamp,
+    digest_of,
+)
 
 MODELS = (Mode, PlantState, Measurement, Estimate, Event)
 EXAMPLES: tuple[Message, ...] = (
@@ -103,13 +113,27 @@ def test_schemas_are_flat(model: type[Message]) -> None:
 
 
 # stamps
-@given(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), NAMES)
-def test_a_stamp_comes_back(number: int, time: int, sender: str) -> None:
-    stamp = Stamp(number, time, node_who(sender))
+@given(
+    st.integers(0, 2**64 - 1),
+    st.integers(0, 2**64 - 1),
+    NAMES,
+    st.just(b"") | st.binary(min_size=DIGEST_SIZE, max_size=DIGEST_SIZE),
+)
+def test_a_stamp_comes_back(number: int, time: int, sender: str, digest: bytes) -> None:
+    stamp = Stamp(number, time, node_who(sender), digest)
     assert Stamp.decode(stamp.encode()) == stamp
 
 
-@pytest.mark.parametrize("attachment", [b"", b"1", bytes(15), bytes(16), bytes(16) + b"\xff"])
+@pytest.mark.parametrize(
+    "attachment", [b"", b"1", bytes(15), bytes(16), bytes(16) + b"\xff", bytes(16) + b"plant\0", bytes(48)]
+)
 def test_what_is_no_stamp_is_refused(attachment: bytes) -> None:
-    with pytest.raises(ValueError, match=r"^a stamp is longer than 16 bytes, this one has|can't decode"):
+    with pytest.raises(ValueError, match=r"^a stamp is longer than 16 bytes|^a digest has 16 bytes, this|can't decode"):
         Stamp.decode(attachment)
+
+
+def test_a_digest_is_of_the_topic_and_the_payload() -> None:
+    """And of where the one ends and the other begins."""
+    digests = {digest_of(topic, payload) for topic in ("mode", "mode1", "event") for payload in (b"", b"1", b"11")}
+    assert len(digests) == 9
+    assert {len(digest) for digest in digests} == {DIGEST_SIZE}

@@ -1,14 +1,15 @@
-"""What the coordinator says of a run that makes no progress."""
+"""What the coordinator says of a run that makes no progress, or that cannot be recorded."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from made_recordings import random_gains, random_problem
 
-from agent.contract.errors import RunBroken
-from agent.contract.messages import Acknowledged
+from agent.contract.errors import RecordingFailed, RunBroken
+from agent.contract.messages import Acknowledged, BrokenOff, Event
 from agent.network.words import Incoming
 from agent.plan import Plan
 from agent.roles import coordinator
@@ -25,6 +26,7 @@ class Scripted:
     def __init__(self, *words: tuple[float, Incoming]) -> None:
         self.now = 1000.0
         self._words = list(words)
+        self.published: list[tuple[str, object]] = []
 
     def receive(self, *, timeout: float) -> Incoming | None:
         if self._words and self._words[0][0] <= timeout:
@@ -35,7 +37,7 @@ class Scripted:
         return None
 
     def publish(self, topic: str, message: object) -> None:
-        """Nobody listens."""
+        self.published.append((topic, message))
 
 
 def acknowledged(steps: int, *lacking: str) -> Acknowledged:
@@ -72,3 +74,21 @@ def test_a_recorder_that_says_nothing_at_all_is_named(monkeypatch: pytest.Monkey
 def test_progress_after_the_deadline_is_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nobody has said what is late, the run goes on."""
     give_out_modes(Scripted((1.5 * DEADLINE, acknowledged(1)), (1.0, acknowledged(2))), monkeypatch)
+
+
+def test_a_run_that_goes_on_without_a_recording_is_announced_once() -> None:
+    bus, words = Scripted(), list[dict[str, Any]]()
+    conductor = Conductor(bus, random_gains(random_problem(1)), Plan(steps=9, seed=0), words.append)  # type: ignore[arg-type]
+    conductor._heed(None)
+    for _ in range(3):
+        conductor._heed(BrokenOff(reason="the disk is full", steps=7, stop=False))
+    sentence = "the disk is full; there is no recording from step 7 on"
+    assert bus.published == [("event", Event(step=0, kind="unrecorded", who="recorder", detail=sentence))]
+    assert words == [{"broken_off": sentence}]
+
+
+def test_a_recorder_may_have_the_run_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    off = BrokenOff(reason="the disk is full", steps=7, stop=True)
+    bus = Scripted((1.0, acknowledged(0).model_copy(update={"broken_off": off})))
+    with pytest.raises(RecordingFailed, match=r"^the disk is full; there is no recording from step 7 on$"):
+        give_out_modes(bus, monkeypatch)

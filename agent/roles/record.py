@@ -1,0 +1,141 @@
+"""What the recorder has: receipts for all that came, and on disk the messages with the evidence of their senders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from agent.contract.errors import InputError, RecordingFailed
+from agent.contract.gains import Gains
+from agent.contract.keys import EVIDENCE
+from agent.contract.messages import Evidence
+from agent.contract.recording import Logged
+from agent.contract.recording.evidence.chains import Chains
+from agent.contract.recording.writer import RecordingWriter, Split
+from agent.network.words import Sample
+from agent.receipts import Receipts
+
+
+class Held(NamedTuple):
+    """What the file holds for sure: every message of the first `steps`, and so many messages in all."""
+
+    steps: int = 0
+    messages: int = 0
+
+
+class Record:
+    """A recording that is being written.
+
+    Where that fails, `failure` says why; from then on there are receipts for what comes, but nothing is written.
+    """
+
+    def __init__(self, path: Path, *, run: dict[str, str], gains: Gains, force: bool, split: Split) -> None:
+        self.receipts = Receipts(gains.problem)
+        self.failure = ""
+        self.held = Held()
+        self._path, self._chains = path, Chains()
+        self._before = Held()  # what the parts before this one hold
+        self._blocks = 0  # of evidence
+        self._writer: RecordingWriter | None = None
+        with self._failing():
+            self._writer = RecordingWriter(path, run=run, gains=gains, force=force, split=split)
+
+    def take(self, sample: Sample, step: int) -> bool:
+        """Take in a message; False where it was there already. Raises RunBroken for what cannot be recorded."""
+        stamp = sample.stamp
+        if not self.receipts.take(sample.topic, step, stamp):
+            return False
+        if self._writer is None:
+            return True
+        now = time.time_ns()
+        number, published = (stamp.number, stamp.time) if stamp is not None else (0, now)
+        try:
+            self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
+            self._note_what_is_held()
+            if stamp is not None and (evidence := self._chains.add(stamp, step)) is not None:
+                self._put(evidence)
+        except RecordingFailed as error:
+            self._give_up(error)
+        return True
+
+    def keep_up(self) -> None:
+        """Flush, and begin the next part, when it is time."""
+        if self._writer is None:
+            return
+        with self._failing():
+            self._writer.flush_when_due()
+            self._note_what_is_held()
+            if self._writer.part_is_full:
+                for evidence in self._chains.rest():
+                    self._put(evidence)
+                self._writer.next_part(self._end())
+                self.held = self._before = self._all
+
+    def finish(self, *, status: str, reason: str) -> None:
+        """End the recording."""
+        if self._writer is None:
+            return
+        with self._failing():
+            for evidence in self._chains.rest(last=True):
+                self._put(evidence)
+            self._writer.finish({"status": status, "reason": reason, **self._end()})
+            self.held = self._all
+
+    def _put(self, evidence: Evidence) -> None:
+        assert self._writer is not None
+        now = time.time_ns()
+        self._writer.add(Logged(EVIDENCE, evidence.encode(), self._blocks, now, now))
+        self._blocks += 1
+        self._note_what_is_held()
+
+    @property
+    def _all(self) -> Held:
+        return Held(self.receipts.complete, self.receipts.messages)
+
+    def _note_what_is_held(self) -> None:
+        if self._writer is not None and self._writer.is_flushed:
+            self.held = self._all
+
+    def _end(self) -> dict[str, str]:
+        """The `end` metadata: what has come since the beginning of the run."""
+        receipts = self.receipts
+        end = {"steps": str(receipts.complete)}
+        for who in sorted(receipts.reached):
+            end[f"received.{who}"] = str(receipts.received.get(who, 0))
+            end[f"reached.{who}"] = str(receipts.reached[who])
+            end[f"missing.{who}"] = str(receipts.missing(who))  # before the last that is there
+        return end | {f"head.{who}": head for who, head in self._chains.heads().items()}
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """A failure of the disk ends the recording, not the recorder."""
+        try:
+            yield
+        except (RecordingFailed, InputError) as error:
+            self._give_up(error)
+
+    def _give_up(self, error: RecordingFailed | InputError) -> None:
+        self.failure = self.failure or str(error)
+        self._note_what_is_held()
+        if isinstance(error, RecordingFailed) and error.gone:
+            self.held = self._before if self._path.parent.is_dir() else Held()
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            with self._failing():
+                writer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

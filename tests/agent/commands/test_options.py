@@ -1,0 +1,30 @@
+"""Sizes and times as people write them."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from agent.commands.options import add_recording_options, recording_plan_of
+from agent.plan import RecordingPlan
+
+
+@pytest.mark.parametrize(
+    ("words", "plan"),
+    [
+        ([], RecordingPlan()),
+        (["--split-size", "100MB"], RecordingPlan(split_size=100_000_000)),
+        (["--split-size", "1.5 gb"], RecordingPlan(split_size=1_500_000_000)),
+        (["--split-size", "2KiB"], RecordingPlan(split_size=2048)),
+        (["--split-size", "1000"], RecordingPlan(split_size=1000)),
+        (["--split-duration", "10min"], RecordingPlan(split_seconds=600.0)),
+        (["--split-duration", "1.5h"], RecordingPlan(split_seconds=5400.0)),
+        (["--split-duration", "90"], RecordingPlan(split_seconds=90.0)),
+        (["--on-record-failure", "continue"], RecordingPlan(goes_on=True)),
+    ],
+)
+def test_sizes_and_times_are_read(words: list[str], plan: RecordingPlan) -> None:
+    parser = argparse.ArgumentParser()
+    add_recording_options(parser)
+    assert recording_plan_of(parser.parse_args(words)) == plan
