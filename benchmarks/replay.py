@@ -140,8 +140,9 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
                 )
                 put(keys.estimate(name), name, estimate)
             put(keys.PLANT_STATE, keys.PLANT, state)
-            mode = problem.mode_names[next(chain)]
-            put(keys.MODE, keys.COORDINATOR, messages.Mode(step=k, mode=mode))
+            index = next(chain)
+            mode = problem.mode_names[index]
+            put(keys.MODE, keys.COORDINATOR, messages.Mode(step=k, mode=mode, index=index))
             x_hat = {name: node.step(part, mode, pairs) for name, part in slices.items()}
         writer.finish({"status": "finished", "reason": "", "steps": str(steps)})
 

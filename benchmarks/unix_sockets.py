@@ -132,7 +132,8 @@ def coordinator(peers: Peers, gains: Gains, steps: int, seed: int, window: int |
     begun = time.perf_counter()
     while complete < steps:
         while released < min(steps, complete + (window or 1)):
-            peers.send(Mode(step=released, mode=names[next(chain)]).encode(), (*nodes, PLANT, RECORDER))
+            index = next(chain)
+            peers.send(Mode(step=released, mode=names[index], index=index).encode(), (*nodes, PLANT, RECORDER))
             released += 1
         if window:
             complete = json.loads(peers.take(RECORDER))["steps"]

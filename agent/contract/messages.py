@@ -14,12 +14,15 @@ from pydantic import ConfigDict, Field
 from agent.contract.frozen import Frozen
 
 
+_UNIT = "in the units of the problem"
+
+
 class Message(Frozen):
     """Flat and finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    step: int = Field(ge=0, lt=2**63)
+    step: int = Field(ge=0, lt=2**63, description="k, counted from 0: messages belong together by it, never by time")
 
     def encode(self) -> bytes:
         """JSON; every float64 comes back bit for bit."""
@@ -32,24 +35,32 @@ class Message(Frozen):
 
 
 class Mode(Message):
-    """r(k): the topology of step k, by name."""
+    """r(k): the topology of step k, by name, and by its place among the topologies for viewers that plot numbers.
 
-    mode: str
+    The name is what counts. A recording made before there was an `index` has -1 for it.
+    """
+
+    mode: str = Field(description="r(k), the name of the topology of step k")
+    index: int = Field(
+        default=-1, ge=-1, lt=2**31, description="its place in the problem's list of topologies, from 0; -1: not said"
+    )
 
 
 class PlantState(Message):
     """The simulated plant at step k: x (nx), z = M x (nz), w (nw), and theta_i for each node in file order."""
 
-    x: list[float]
-    z: list[float]
-    w: list[float]
-    arrived: list[int]
+    x: list[float] = Field(description=f"x(k), the state, nx numbers; {_UNIT}")
+    z: list[float] = Field(description=f"z(k) = M x(k), what is to be estimated, nz numbers; {_UNIT}")
+    w: list[float] = Field(description=f"w(k), the disturbance, nw numbers; {_UNIT}")
+    arrived: list[int] = Field(
+        description="theta_i(k) of each node in the order of the problem: 1 its measurement arrived, 0 it was lost"
+    )
 
 
 class Measurement(Message):
     """y_i(k), eq. (2), (ny_i); empty where nothing arrived at a node that sees its losses."""
 
-    y: list[float]
+    y: list[float] = Field(description=f"y_i(k), ny_i numbers; [] where nothing arrived and the node sees it; {_UNIT}")
 
 
 class Estimate(Message):
@@ -60,19 +71,19 @@ class Estimate(Message):
     nodes whose messages of step k - 1 went into it; at step 0, where x_hat is the initial 0, "" and [].
     """
 
-    x_hat: list[float]
-    innovation: list[float]
-    z_hat: list[float]
-    mode: str
-    heard: list[str]
+    x_hat: list[float] = Field(description=f"x_hat_i(k), the node's estimate of x(k), nx numbers; {_UNIT}")
+    innovation: list[float] = Field(description=f"y_i(k) less what the node expected of it, ny_i numbers; {_UNIT}")
+    z_hat: list[float] = Field(description=f"z_hat_i(k) = M x_hat_i(k), its estimate of z(k), nz numbers; {_UNIT}")
+    mode: str = Field(description='the mode of step k - 1, by which x_hat was made; "" at step 0')
+    heard: list[str] = Field(description="the nodes whose messages of step k - 1 went into x_hat; [] at step 0")
 
 
 class Event(Message):
     """Something worth knowing: `kind` (a word), `who` it is about, `detail` in words."""
 
-    kind: str
-    who: str
-    detail: str
+    kind: str = Field(description="what happened, in a word")
+    who: str = Field(description="whom it is about: coordinator, plant, recorder, node-<name> or sensor-<name>")
+    detail: str = Field(description="what happened, in words")
 
 
 class Evidence(Message):

@@ -115,7 +115,8 @@ class Conductor:
         for step in range(self._plan.steps):
             while step >= self.complete + self._plan.window:
                 self._wait_for_progress()
-            self._bus.publish(MODE, Mode(step=step, mode=names[next(chain)]))
+            index = next(chain)
+            self._bus.publish(MODE, Mode(step=step, mode=names[index], index=index))
         while self.complete < self._plan.steps:
             self._wait_for_progress()
 

@@ -166,6 +166,8 @@ class Topic:
         if fault:
             self.faults.add(f"{self.topic}, step {message.step}: {fault}")
             return message.step
+        if isinstance(message, Mode) and message.index not in (-1, modes.number(message.mode)):
+            self.faults.add(f'{self.topic}, step {message.step}: index {message.index} is not that of "{message.mode}"')
         self._steps.append(message.step)
         self._numbers.append(logged.number)
         self._times.append(logged.log_time)

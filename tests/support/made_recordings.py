@@ -222,7 +222,7 @@ def simulate(
         mode = problem.mode_names[s]
         for kind in (kind for step, kind in events if step == k):
             sent.add("event", keys.COORDINATOR, step=k, kind=kind, who="coordinator", detail="")
-        sent.add("mode", keys.COORDINATOR, step=k, mode=mode)
+        sent.add("mode", keys.COORDINATOR, step=k, mode=mode, index=s)
         before, x = x_hat, A @ x + B @ w
         phi, x_hat = deliveries.at(k), {}
         for i, name in enumerate(problem.node_names):

@@ -25,7 +25,7 @@ from agent.contract.messages import (
 
 MODELS = (Mode, PlantState, Measurement, Estimate, Event)
 EXAMPLES: tuple[Message, ...] = (
-    Mode(step=3, mode="joined"),
+    Mode(step=3, mode="joined", index=1),
     PlantState(step=3, x=[0.1, -0.0], z=[5e-324], w=[1e308], arrived=[1, 0]),
     Measurement(step=3, y=[1 / 3]),
     Estimate(step=3, x_hat=[0.1], innovation=[0.2], z_hat=[0.3], mode="joined", heard=["1", "2"]),
@@ -106,10 +106,23 @@ def test_schemas_are_flat(model: type[Message]) -> None:
     assert "step" in schema["required"]
     assert "$defs" not in schema
     for field in schema["properties"].values():
+        assert field["description"]
         if field["type"] == "array":
             assert field["items"]["type"] in {"number", "integer", "string"}
         else:
             assert field["type"] in {"integer", "string"}
+
+
+def test_a_mode_of_an_older_recording_is_read() -> None:
+    """It has no index."""
+    assert Mode.decode(b'{"step":3,"mode":"joined"}') == Mode(step=3, mode="joined", index=-1)
+
+
+def test_numbers_name_their_unit() -> None:
+    for model in MODELS:
+        for name, field in model.model_json_schema()["properties"].items():
+            numbers = field["type"] == "array" and field["items"]["type"] == "number"
+            assert ("units of the problem" in field["description"]) == numbers, name
 
 
 # stamps
