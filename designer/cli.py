@@ -13,7 +13,19 @@ from importlib.metadata import version
 import agent.cli
 from agent.commands.roles import add_roles
 from agent.contract.errors import EXIT_INPUT
-from designer.commands import analyse, design, recordings, recover, report, reproduce, runs, show, simulate, verify
+from designer.commands import (
+    analyse,
+    compare,
+    design,
+    recordings,
+    recover,
+    report,
+    reproduce,
+    runs,
+    show,
+    simulate,
+    verify,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     runs.add_run(commands)
     recordings.add_replay(commands)
     recover.add_recover(commands)
+    compare.add_compare(commands)
     simulate.add_simulate(commands)
     report.add_report(commands)
     reproduce.add_reproduce(commands)
