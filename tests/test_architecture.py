@@ -50,10 +50,12 @@ ROOMS = {
     "designer.simulation": "designer.model designer.workers",
     "designer.replay": "agent.contract.recording designer.model designer.proof",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
+    "designer.compare": "agent.contract.recording",
     "designer.show": "agent.contract.recording",
-    "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.diagnosis designer.gain "
-    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
-    "designer.search designer.show designer.simulation designer.synthesis designer.what_if",
+    "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
+    "designer.diagnosis designer.gain designer.ladder designer.problems designer.proof designer.replay "
+    "designer.report designer.reproduce designer.search designer.show designer.simulation designer.synthesis "
+    "designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
