@@ -17,6 +17,7 @@ from designer.commands import (
     analyse,
     compare,
     design,
+    export,
     recordings,
     recover,
     report,
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     recordings.add_replay(commands)
     recover.add_recover(commands)
     compare.add_compare(commands)
+    export.add_export(commands)
     simulate.add_simulate(commands)
     report.add_report(commands)
     reproduce.add_reproduce(commands)

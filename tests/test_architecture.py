@@ -51,11 +51,12 @@ ROOMS = {
     "designer.replay": "agent.contract.recording designer.model designer.proof",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
+    "designer.export": "designer.model designer.replay",
     "designer.show": "agent.contract.recording",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
-    "designer.diagnosis designer.gain designer.ladder designer.problems designer.proof designer.replay "
-    "designer.report designer.reproduce designer.search designer.show designer.simulation designer.synthesis "
-    "designer.what_if",
+    "designer.diagnosis designer.export designer.gain designer.ladder designer.problems designer.proof "
+    "designer.replay designer.report designer.reproduce designer.search designer.show designer.simulation "
+    "designer.synthesis designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
@@ -68,7 +69,8 @@ DOORS = {
     "lz4": ["agent/contract/recording/"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": ["designer/lmi/", "designer/gain/exact.py"],
+    "scipy": ["designer/lmi/", "designer/gain/exact.py", "designer/export/matlab.py"],
+    "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/"],
     "rich": ["agent/commands/words.py", "designer/commands/"],

@@ -30,7 +30,8 @@ def outside(source: str) -> set[str]:
 
 def undeclared(imports: Iterable[str]) -> set[str]:
     """What no requirement brings."""
-    requirements = PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["dask"]
+    extras = PROJECT["project"]["optional-dependencies"]
+    requirements = [*PROJECT["project"]["dependencies"], *extras["dask"], *extras["parquet"], *extras["foxglove"]]
     declared = {re.split("[<>=]", requirement)[0] for requirement in requirements}
     provided = packages_distributions()
     return {name for name in imports if not declared & {found.lower() for found in provided.get(name, [])}} - OPTIONAL

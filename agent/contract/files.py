@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +37,18 @@ def refuse_overwrite(path: Path, *, force: bool) -> None:
 
 def write_whole(path: Path, data: bytes, *, force: bool = False) -> None:
     """Write `data` beside `path`, then rename: a reader sees the old file or the new one, nothing between."""
+    with writing_whole(path, force=force) as part, part.open("wb") as file:
+        file.write(data)
+
+
+@contextmanager
+def writing_whole(path: Path, *, force: bool = False) -> Iterator[Path]:
+    """A file beside `path` to write to; it gets the name `path` at the end of the block, and goes where that fails."""
     refuse_overwrite(path, force=force)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
+        yield part
+        with part.open("rb") as file:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:

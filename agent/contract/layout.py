@@ -14,7 +14,7 @@ from agent.contract.problem import Problem
 
 
 def foxglove_layout(problem: Problem) -> dict[str, Any]:
-    """z with every z_hat_i, the first entry of every innovation, and the modes: as a number by step, in words by time."""
+    """z with every z_hat_i, the first entries of the innovations, and the modes: numbers by step, words by time."""
     outputs = {f"z[{row}]": (PLANT_STATE, f"z[{row}]") for row in range(problem.nz)}
     innovations = {}
     for name in problem.node_names:

@@ -13,7 +13,6 @@ from pydantic import ConfigDict, Field
 
 from agent.contract.frozen import Frozen
 
-
 _UNIT = "in the units of the problem"
 
 
