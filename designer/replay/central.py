@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from agent.contract.gains import Gains
+from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
+from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_links, stacks
 from designer.replay.topics import Numbers
 
 FLOOR = 1e-140  # magnitudes below it count as this: their squares underflow in the free run's bound
@@ -31,8 +31,13 @@ class Central:
 
     @classmethod
     def of(cls, gains: Gains) -> Central:
-        K_bar, H_bar = stacked_gains(gains)
-        return cls(gains.problem, error_model(gains.problem, K_bar, H_bar), stacks(gains.problem), K_bar, H_bar)
+        return cls.of_links(gains.problem, gains.K, gains.H)
+
+    @classmethod
+    def of_links(cls, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Central:
+        """Of gains that are in no file yet."""
+        K_bar, H_bar = stacked_links(problem, K, H)
+        return cls(problem, error_model(problem, K_bar, H_bar), stacks(problem), K_bar, H_bar)
 
     @cached_property
     def C_nu(self) -> Array:
