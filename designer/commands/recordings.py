@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import InputError
+from designer.commands.more import add_more, replay_more
 
 if TYPE_CHECKING:
     from designer.replay.part import Part
@@ -32,6 +33,7 @@ def add_replay(commands: Subcommands) -> None:
     replay.add_argument("--from", dest="first", type=_step, metavar="STEP", help="judge from this step on (0)")
     replay.add_argument("--to", dest="last", type=_step, metavar="STEP", help="judge up to this step (the last)")
     replay.add_argument("--node", metavar="NAME", help="judge what this node measured and sent alone")
+    add_more(replay)
     replay.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -49,6 +51,8 @@ def replay_command(options: argparse.Namespace) -> int:
     from designer.replay.several import replay_all, together
 
     groups = together(options.recordings, run=options.run)
+    if options.other is not None or options.write is not None:
+        return replay_more(groups, options, part=_part(options), report=Progress())
     with_options = {"run": options.run, "gains": options.gains, "part": _part(options), "report": Progress()}
     if len(groups) > 1:
         table = replay_all(groups, **with_options)

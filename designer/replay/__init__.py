@@ -124,13 +124,14 @@ class Tally:
             self.compared[check.proof] += int(known.sum())
             self.gaps[check.proof] = max(self.gaps[check.proof], float(gap.max()))
             if self.worst is None or gap.max() > self.worst.gap:
-                self.worst = self._divergence(check, int(gap.argmax()))
+                row, column = divmod(int(gap.argmax()), gap.shape[1])
+                self.worst = check.divergence(row, column, self._names)
             self.later[kind_of(check.field, check.proof)] += int((gap > self.tolerance).sum())
             beyond = np.flatnonzero((gap > self.tolerance).any(axis=1))
             if len(beyond) and (self.first is None or check.first + beyond[0] < self.first.step):
                 row = int(beyond[0])
                 column = int(np.argmax(gap[row] > self.tolerance))
-                self.first = self._divergence(check, row * gap.shape[1] + column)
+                self.first = check.divergence(row, column, self._names)
 
     def beside_the_first(self) -> dict[str, int]:
         """How many diverge beside the first, by kind."""
@@ -145,22 +146,6 @@ class Tally:
         if self.part.node is not None:
             judged = judged & (check.owner == self._names.index(self.part.node))
         return check._replace(gap=np.where(judged, check.gap, np.nan))
-
-    def _divergence(self, check: Check, place: int) -> Divergence:
-        row, column = divmod(place, check.gap.shape[1])
-        owner = int(check.owner[column])
-        position = column - int(np.argmax(check.owner == owner))
-        logged, expected = float(check.logged[row, column]), float(check.expected[row, column])
-        vector = not check.words and check.field != "arrived"
-        return Divergence(
-            step=check.first + row,
-            node=self._names[owner] if owner >= 0 else None,
-            field=f"{check.field}[{position}]" if vector else check.field,
-            gap=float(check.gap[row, column]),
-            expected=check.words[int(expected)] if check.words else expected,
-            logged=check.words[int(logged)] if check.words else logged,
-            proof=check.proof,
-        )
 
 
 class PathAudit:

@@ -16,6 +16,7 @@ from designer.replay.central import FLOOR, Central, Flags
 from designer.replay.inputs import Drawn, Inputs, logged_plant, logged_states
 from designer.replay.log import Log
 from designer.replay.topics import Numbers
+from designer.replay.verdict import Divergence
 
 MEASURED = ("[]", "numbers")  # what a measurement of a node that sees its losses is
 
@@ -35,6 +36,22 @@ class Check(NamedTuple):
     logged: Array  # (steps, columns); positions in `words` where there are any
     expected: Array
     words: Sequence[str] = ()
+
+    def divergence(self, row: int, column: int, node_names: Sequence[str]) -> Divergence:
+        """One of its numbers, or names, beside what it should be."""
+        owner = int(self.owner[column])
+        position = column - int(np.argmax(self.owner == owner))
+        logged, expected = float(self.logged[row, column]), float(self.expected[row, column])
+        is_vector = not self.words and self.field != "arrived"
+        return Divergence(
+            step=self.first + row,
+            node=node_names[owner] if owner >= 0 else None,
+            field=f"{self.field}[{position}]" if is_vector else self.field,
+            gap=float(self.gap[row, column]),
+            expected=self.words[int(expected)] if self.words else expected,
+            logged=self.words[int(logged)] if self.words else logged,
+            proof=self.proof,
+        )
 
 
 def numbers(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pytest
-from foxglove.layouts import PlotConfig, PlotSeries, PlotXAxisPath, StateTransitionsConfig, StateTransitionsSeries
+from foxglove.layouts import StateTransitionsConfig, StateTransitionsSeries
+from foxglove_settings import TITLE, faults, unknown
 from made_recordings import random_gains, random_problem, record, simulate
 from places import GOLDEN
 from runs import logged
@@ -19,32 +20,11 @@ from agent.contract.messages import Mode
 from agent.contract.problem import Problem
 from designer.problems import find
 
-TITLE = "foxglovePanelTitle"  # of any panel
 PROBLEM = random_problem(3, nz=2)
 
 
 def panels(problem: Problem, kind: str) -> list[dict[str, Any]]:
     return [panel for name, panel in foxglove_layout(problem)["configById"].items() if name.startswith(f"{kind}!")]
-
-
-def unknown(document: dict[str, Any], model: type, *more: str) -> list[str]:
-    """What the field's own SDK does not know of a panel's or a series' settings, names and words."""
-    names = model()._to_dict()
-    words = {}
-    for name, hint in get_type_hints(model).items():
-        camel = re.sub(r"_(\w)", lambda found: found[1].upper(), name)
-        words[camel] = [word for part in get_args(hint) for word in get_args(part)] or None
-    return [name for name in document if name not in names and name not in more] + [
-        f"{name}: {value}"
-        for name, value in document.items()
-        if words.get(name) and isinstance(value, str) and value not in words[name]
-    ]
-
-
-def faults(plot: dict[str, Any]) -> list[str]:
-    """Of a whole plot."""
-    found = unknown(plot, PlotConfig, TITLE) + unknown(plot["xAxisPath"], PlotXAxisPath)
-    return found + [fault for series in plot["paths"] for fault in unknown(series, PlotSeries)]
 
 
 def test_every_setting_is_one_of_foxglove() -> None:
