@@ -64,6 +64,7 @@ ROOMS = {
 # Each outside thing behind as few doors as can be.
 DOORS = {
     "zenoh": ["agent/network/session.py"],
+    "foxglove": ["agent/roles/viewer.py"],
     "mcap": ["agent/contract/recording/"],
     "zstandard": ["agent/contract/recording/"],
     "lz4": ["agent/contract/recording/"],

@@ -131,6 +131,11 @@ def count(text: str) -> int:
     return _whole(text, least=1, most=2**31 - 1)
 
 
+def port(text: str) -> int:
+    """The type of --port."""
+    return _whole(text, least=0, most=2**16 - 1)
+
+
 def _window(text: str) -> int:
     return _whole(text, least=1, most=LARGEST_WINDOW)
 

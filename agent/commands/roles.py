@@ -1,4 +1,4 @@
-"""`peakmesh node`, `plant`, `coordinator` and `recorder`: one role in this process, for separate machines."""
+"""`peakmesh node`, `plant`, `coordinator`, `recorder`: one role in this process, for separate machines; and `live`."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from agent.commands.options import (
     default_recording,
     load_gains,
     plan_of,
+    port,
     positive,
     recording_plan_of,
     run_name,
@@ -44,6 +45,11 @@ def add_roles(commands: Subcommands) -> None:
     recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
     add_output_options(recorder, *RECORDING)
     add_recording_options(recorder)
+    live = _role(commands, "live", live_command, "show a running network to Foxglove (peakmesh[foxglove])")
+    live.add_argument("--host", default="127.0.0.1", metavar="HOST", help="where Foxglove connects to (127.0.0.1)")
+    live.add_argument(
+        "--port", type=port, default=8765, metavar="N", help="port for Foxglove (8765); 0 takes a free one"
+    )
 
 
 def _role(
@@ -124,6 +130,22 @@ def recorder_command(options: argparse.Namespace) -> int:
     with Bus(_network(options), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
     print(f"recording  {' '.join(map(str, files_of(path)))}")
+    return EXIT_GOOD
+
+
+def live_command(options: argparse.Namespace) -> int:
+    """`peakmesh live GAINS`: looks on, and takes no part."""
+    from agent.roles import viewer
+
+    gains = load_gains(options.gains)
+    viewer.run(
+        _network(options),
+        gains,
+        run=options.run or gains.problem.name,
+        host=options.host,
+        port=options.port,
+        say=lambda address: print(f"open {address} in Foxglove", file=sys.stderr, flush=True),
+    )
     return EXIT_GOOD
 
 

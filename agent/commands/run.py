@@ -71,7 +71,7 @@ def run_gains(
     run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
     refuse_recording(recording, force=options.force)
-    with progress(plan.steps) as report:
+    with progress(plan.steps, live=f"peakmesh live {path} --run {run}") as report:
         summary = launch(
             path,
             gains,

@@ -40,8 +40,11 @@ def say_broken_off(sentence: object) -> None:
 
 
 @contextmanager
-def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A bar on stderr, where that is a terminal; the function takes the coordinator's words."""
+def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A bar on stderr, where that is a terminal; the function takes the coordinator's words.
+
+    `live` is the command that looks on, but for the address.
+    """
 
     def warn(word: dict[str, Any]) -> None:
         if "broken_off" in word:
@@ -58,7 +61,11 @@ def progress(steps: int) -> Iterator[Callable[[dict[str, Any]], None]]:
 
         def show(word: dict[str, Any]) -> None:
             warn(word)
-            if "started" in word:
+            if "listening" in word:
+                bar.console.print(
+                    f"look on with: {live} --connect {word['listening'][0]}", highlight=False, soft_wrap=True
+                )
+            elif "started" in word:
                 bar.update(task, description="steps")
             elif "complete" in word:
                 bar.update(task, completed=word["complete"])

@@ -19,6 +19,7 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
+| watch/<data topic>     | the same    | publishers, to viewers     | viewers, where there are any, without stamp|
 
 The recorder writes one more topic to the file, which is never on the wire:
 
@@ -106,6 +107,11 @@ def ready(who: str) -> str:
 
 def replay(who: str) -> str:
     return f"replay/{who}"
+
+
+def watch(topic: str) -> str:
+    """Where viewers are shown the messages of a data topic."""
+    return f"watch/{topic}"
 
 
 # who there is

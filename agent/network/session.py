@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import alive, key, replay, topic_of
+from agent.contract.keys import alive, key, replay, topic_of, watch
 from agent.contract.messages import Stamp
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
@@ -22,10 +22,14 @@ from agent.plan import LARGEST_WINDOW
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
 BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word
+DROP = zenoh.CongestionControl.DROP  # what viewers get: one that stands still must hold up nobody
 
 
 class Channel:
-    """A topic's messages, in order. They wait in zenoh, without running any Python, until they are asked for."""
+    """A topic's messages, in order. They wait in zenoh, without running any Python, until they are asked for.
+
+    Without a `topic` it has what viewers are shown, of every topic.
+    """
 
     def __init__(self, topic: str, handler: Any) -> None:
         self._topic, self._handler = topic, handler
@@ -33,9 +37,10 @@ class Channel:
     def next(self) -> Sample:
         """The next message; blocks until there is one. Raises ChannelClosed."""
         try:
-            return _sample(self._topic, self._handler.recv())
+            sample = self._handler.recv()
         except zenoh.ZError:
             raise ChannelClosed from None
+        return _sample(self._topic or topic_of(str(sample.key_expr)).removeprefix(watch("")), sample)
 
     def waiting(self) -> Iterator[Sample]:
         """The messages that are there already; does not block."""
@@ -49,6 +54,8 @@ class Session:
     def __init__(self, network: Network, *, run: str, hand_over: Callable[[Duty], None]) -> None:
         self._run, self._hand_over = run, hand_over
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._shown: dict[str, zenoh.Publisher] = {}  # the same for viewers
+        self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._zenoh = _open(network)
         self.identity = str(self._zenoh.zid())
@@ -60,15 +67,33 @@ class Session:
         self._declared.append(subscriber)
         return Channel(topic, subscriber.handler)
 
+    def overhear(self) -> Channel:
+        """Receive what is shown to viewers, of every topic; what is not taken in time goes, the oldest first."""
+        kept: Any = zenoh.handlers.RingChannel(CAPACITY)
+        subscriber = self._zenoh.declare_subscriber(key(self._run, watch("**")), kept)
+        self._declared.append(subscriber)
+        return Channel("", subscriber.handler)
+
     def advertise(self, topic: str, *, express: bool) -> None:
         """Announce that a topic will be published; an `express` message does not wait for others to go with."""
         self._publishers[topic] = self._zenoh.declare_publisher(
             key(self._run, topic), congestion_control=BLOCK, express=express
         )
+        shown = self._shown[topic] = self._zenoh.declare_publisher(
+            key(self._run, watch(topic)), congestion_control=DROP
+        )
+        self._watched[topic] = False
+
+        def note(status: zenoh.MatchingStatus) -> None:
+            self._watched[topic] = status.matching
+
+        self._declared.append(shown.declare_matching_listener(note))
 
     def publish(self, sent: Sent) -> None:
-        """Send a message of an advertised topic."""
+        """Send a message of an advertised topic; where a viewer is there, to it too, as long as it keeps up."""
         self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode())
+        if self._watched[sent.topic]:
+            self._shown[sent.topic].put(sent.payload)
 
     def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]]) -> None:
         """Answer requests for the messages of `who` from a number on."""

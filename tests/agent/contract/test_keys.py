@@ -34,6 +34,7 @@ from agent.contract.keys import (
     sender_of,
     sensor_who,
     topic_of,
+    watch,
 )
 from agent.contract.messages import Estimate, Event, Measurement, Mode, PlantState
 
@@ -92,6 +93,7 @@ def test_the_table_names_every_key_of_the_code() -> None:
         CONTROL: "Control",
         ACKNOWLEDGED: "Acknowledged",
         replay("<who>"): "queryable",
+        watch("<data topic>"): "the same",
     }
     assert table == topics | others
 

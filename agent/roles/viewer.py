@@ -1,0 +1,110 @@
+"""The viewer: shows a running network to Foxglove. It only listens: a run is the same with and without it.
+
+Publishers send to it what it has time for, so that it holds up nobody, even where it stands still; Foxglove's server,
+too, drops what a client is too slow for. So it is never used for recording.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from types import FrameType
+from typing import Any, NoReturn
+
+from agent.contract.errors import InputError, Interrupted, RunBroken
+from agent.contract.gains import Gains
+from agent.contract.keys import COORDINATOR, EVENT, MODE, PLANT_STATE, estimate, measurement, model_of
+from agent.network.configuration import Network
+from agent.network.session import Channel, Session
+from agent.network.words import ChannelClosed, Words
+
+
+def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: Callable[[str], None]) -> None:
+    """Serve run `run` at ws://host:port until it has ended; `say` gets the address as soon as clients may come.
+
+    Raises RunBroken where the run is not there within `network.wait` seconds, InputError where the port is taken.
+    """
+    words = Words("")
+    with _stopped_by_signals(), closing(Session(network, run=run, hand_over=words.put)) as session:
+        overheard = session.overhear()
+        with _server(gains, run, host, port) as (address, show):
+            say(address)
+            session.watch()
+            _wait_for_coordinator(words, run, network.wait)
+            threading.Thread(target=_pass_on, args=(overheard, show), daemon=True).start()
+            while COORDINATOR in words.present:
+                words.take(math.inf)
+
+
+def _wait_for_coordinator(words: Words, run: str, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while COORDINATOR not in words.present:
+        if time.monotonic() >= deadline:
+            raise RunBroken(f'the coordinator of run "{run}" was not found within {seconds:g} s')
+        words.take(deadline)
+
+
+def _pass_on(overheard: Channel, show: Callable[[str, bytes], None]) -> None:
+    """Until the session is closed."""
+    while True:
+        try:
+            sample = overheard.next()
+        except ChannelClosed:
+            return
+        show(sample.topic, sample.payload)
+
+
+@contextmanager
+def _server(gains: Gains, run: str, host: str, port: int) -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
+    """Foxglove's server with a channel for each topic of the run: its address, and what takes the messages."""
+    try:
+        import foxglove
+    except ImportError:
+        raise InputError("live needs Foxglove's SDK: pip install 'peakmesh[foxglove]'") from None
+    names, context = gains.problem.node_names, foxglove.Context()
+    topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
+    channels = {topic: _channel(foxglove, topic, context) for topic in topics}
+    try:
+        server = foxglove.start_server(name=f"peakmesh: {run}", host=host, port=port, context=context)
+    except RuntimeError as error:
+        raise InputError(f"{host}:{port} cannot be listened on: {error}; --port 0 takes a free one") from None
+
+    def show(topic: str, payload: bytes) -> None:
+        if topic in channels:
+            channels[topic].log(payload, log_time=time.time_ns())
+
+    try:
+        yield f"ws://{host}:{server.port}", show
+    finally:
+        server.stop()
+
+
+def _channel(foxglove: Any, topic: str, context: Any) -> Any:
+    """With the schema that a recording has."""
+    model = model_of(topic)
+    assert model is not None
+    schema = json.dumps(model.model_json_schema()).encode()
+    return foxglove.Channel(
+        topic,
+        schema=foxglove.Schema(name=f"peakmesh.{model.__name__}", encoding="jsonschema", data=schema),
+        message_encoding="json",
+        context=context,
+    )
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise Interrupted(number)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
