@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from agent.contract.errors import InputError, counted, listed
 from agent.contract.gains import Gains
 from agent.contract.keys import EVIDENCE
+from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
@@ -53,6 +55,27 @@ def describe(
     if path.suffix == ".toml":
         return {"file": str(path), **_problem(Problem.load(path))}
     raise InputError(f"{path} is neither a problem (.toml), nor a gains file (JSON), nor a recording (MCAP)")
+
+
+def attachment(path: Path, name: str, *, run: str | None = None, gains: Path | None = None) -> bytes:
+    """What is attached to a recording under a name; `run` and `gains` as in `describe`.
+
+    gains.json and problem.json are those that the run was made with, by their digests, whatever else has these names;
+    a layout.json that a tool left out is made anew. Raises InputError where there is nothing of the kind.
+    """
+    with RecordingReader(path, run=run, gains=gains, needs_gains=False) as reader:
+        match name:
+            case "gains.json":
+                return reader.gains.canonical()
+            case "problem.json":
+                return reader.gains.problem.canonical()
+        data = reader.attachment(name)
+        if data is not None:
+            return data
+        if name == "layout.json":
+            return json.dumps(foxglove_layout(reader.gains.problem)).encode()
+        there = listed(sorted({"gains.json", "problem.json", "layout.json", *reader.attached}))
+        raise InputError(f'{path} has no attachment "{name}"; it has {there}')
 
 
 def text(facts: dict[str, Any]) -> str:

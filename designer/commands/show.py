@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from pathlib import Path
 
 from agent.commands.options import Subcommands, add_command
-from agent.contract.errors import EXIT_GOOD
+from agent.contract.errors import EXIT_GOOD, InputError
+from agent.contract.files import refuse_overwrite, write_whole
 from designer.commands.recordings import Progress, add_choice
 
 
@@ -15,6 +18,11 @@ def add_show(commands: Subcommands) -> None:
     show = add_command(commands, "show", show_command, "what a file is; without one, the built-in problems")
     show.add_argument("file", nargs="?", metavar="FILE", help="problem, gains file or recording")
     add_choice(show)
+    show.add_argument(
+        "--get", metavar="NAME", help="take an attachment out of a recording: layout.json, gains.json or problem.json"
+    )
+    show.add_argument("-o", "--output", type=Path, metavar="FILE", help="where --get writes it to (to stdout)")
+    show.add_argument("--force", action="store_true", help="replace that file if it exists")
     show.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -22,9 +30,31 @@ def show_command(options: argparse.Namespace) -> int:
     """`peakmesh show [FILE]`."""
     from designer import show
 
+    if options.get is not None:
+        return _get(options)
+    if options.output is not None:
+        raise InputError("--output is for --get, which takes an attachment out of a recording")
     tell = Progress()
     facts = show.describe(
         options.file, run=options.run, gains=options.gains, report=lambda done, of: tell("reading", done, of)
     )
     print(json.dumps(facts) if options.json else show.text(facts))
+    return EXIT_GOOD
+
+
+def _get(options: argparse.Namespace) -> int:
+    """`peakmesh show RECORDING --get NAME`."""
+    from designer import show
+
+    if options.file is None:
+        raise InputError("--get takes an attachment out of a recording; name the recording")
+    if options.output is not None:
+        refuse_overwrite(options.output, force=options.force)
+    data = show.attachment(Path(options.file), options.get, run=options.run, gains=options.gains)
+    if options.output is None:
+        sys.stdout.buffer.write(data)
+        return EXIT_GOOD
+    write_whole(options.output, data, force=options.force)
+    facts = {"attachment": options.get, "output": str(options.output), "bytes": len(data)}
+    print(json.dumps(facts) if options.json else f"{options.get}, {len(data)} bytes: {options.output}")
     return EXIT_GOOD

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import rewriting
 from made_recordings import random_gains, random_problem, real_problem, record, simulate
 from places import ROOT
+from runs import answer, peakmesh
 
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
+from agent.contract.layout import foxglove_layout
 from designer import show
+from designer.problems import find
 
 GAINS = random_gains(random_problem(3))
 STEPS = 12
@@ -124,3 +129,53 @@ def test_what_is_none_of_these_is_refused_in_one_sentence(tmp_path: Path) -> Non
         show.describe(tmp_path / "nowhere")
     with pytest.raises(InputError, match="could not be read"):
         show.describe(tmp_path)
+
+
+# attachments
+@pytest.mark.parametrize("name", ["gains.json", "problem.json", "layout.json"])
+def test_an_attachment_is_taken_out(name: str, tmp_path: Path) -> None:
+    """As somebody else's reader finds it in the file."""
+    from mcap.reader import make_reader
+
+    with GOLDEN.open("rb") as file:
+        attached = {found.name: found.data for found in make_reader(file).iter_attachments()}
+    assert show.attachment(GOLDEN, name) == attached[name]
+    done = peakmesh("show", GOLDEN, "--get", name, "-o", tmp_path / "out.json", "--json")
+    assert answer(done) == {"attachment": name, "output": str(tmp_path / "out.json"), "bytes": len(attached[name])}
+    assert (tmp_path / "out.json").read_bytes() == attached[name]
+    assert peakmesh("show", GOLDEN, "--get", name).stdout.encode() == attached[name]
+
+
+def test_gains_that_were_taken_out_are_the_runs_own(tmp_path: Path) -> None:
+    """Whatever else is attached under that name."""
+    contents = rewriting.read(GOLDEN)
+    foreign = ("gains.json", b'{"pid": [1, 2]}'), ("layout.json", b"{}")
+    path = rewriting.write(tmp_path / "run.mcap", replace(contents, attachments=(*foreign, *contents.attachments)))
+    assert show.attachment(path, "gains.json") == Gains.load(GOLDEN.with_suffix(".gains.json")).canonical()
+
+
+def test_a_layout_that_was_left_out_is_made_anew(tmp_path: Path) -> None:
+    contents = rewriting.read(GOLDEN)
+    kept = tuple(attached for attached in contents.attachments if attached[0] != "layout.json")
+    path = rewriting.write(tmp_path / "run.mcap", replace(contents, attachments=kept))
+    assert json.loads(show.attachment(path, "layout.json")) == foxglove_layout(find("zhu2020-lossy"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            [GOLDEN, "--get", "camera.png"],
+            'has no attachment "camera.png"; it has "gains.json", "layout.json" and "problem.json"',
+        ),
+        ([GOLDEN.with_suffix(".gains.json"), "--get", "layout.json"], "is not a recording"),
+        (["--get", "layout.json"], "name the recording"),
+        ([GOLDEN, "-o", "out.json"], "--output is for --get"),
+        ([GOLDEN, "--get", "gains.json", "-o", "."], "is a folder"),
+    ],
+)
+def test_what_cannot_be_taken_out_is_refused(words: list[object], said: str, tmp_path: Path) -> None:
+    done = peakmesh("show", *words, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert said in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -152,6 +152,11 @@ class RecordingReader:
         told = self.run.get("recovered.faults")
         return [*contents.altered(self._chosen, self._surveys), *([told] if told else [])]
 
+    @property
+    def attached(self) -> list[str]:
+        """The names of all attachments."""
+        return list(dict.fromkeys(found.name for one in self._surveys for found in one.attachments))
+
     def attachment(self, name: str) -> bytes | None:
         """The bytes of the first sound attachment of this name, None where there is none."""
         found = (contents.attachment(one, name) for one in self._surveys)
