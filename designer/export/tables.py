@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,7 @@ def write_parquet(log: Log, output: Path, *, wide: bool, force: bool) -> int:
         import pyarrow.parquet as pq
     except ImportError:
         raise InputError("--parquet needs pyarrow: pip install 'peakmesh[parquet]'") from None
+    _give_back()
     parts = list(columns(log))
     word = pa.dictionary(pa.int32(), pa.string())
     whose, fields = _dictionary(column.whose for column in parts), _dictionary(column.field for column in parts)
@@ -60,10 +63,20 @@ def write_parquet(log: Log, output: Path, *, wide: bool, force: bool) -> int:
     titles = ["step", "mode_name", *(column.title for column in parts)] if wide else LONG
     types = [pa.int64(), word, *[pa.float64()] * len(parts)] if wide else [pa.int64(), word, word, pa.float64()]
     schema = pa.schema(list(zip(titles, types, strict=True)))
-    with writing_whole(output, force=force) as part, pq.ParquetWriter(part, schema) as writer:
+    words = [field.name for field in schema if field.type == word]  # numbers that hardly repeat need no dictionary
+    with (
+        writing_whole(output, force=force) as part,
+        pq.ParquetWriter(part, schema, use_dictionary=words) as writer,
+    ):
         for now in _blocks(log, parts):
             writer.write_table(pa.table(block(now), schema=schema))
     return log.steps if wide else log.steps * len(parts)
+
+
+def _give_back() -> None:
+    """Free memory, back to the system: glibc keeps 77 MB after 2 million messages, and pyarrow's code takes 70."""
+    with suppress(OSError, AttributeError):  # another C library has no such function, or no need of it
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _blocks(log: Log, parts: list[Column]) -> Iterator[slice]:
