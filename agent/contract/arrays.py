@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from typing import Annotated, Any
 
@@ -62,6 +63,17 @@ def _matrix(value: Any) -> Array:
 
 
 Matrix = Annotated[Array, PlainValidator(_matrix), PlainSerializer(lambda array: array.tolist())]
+
+
+def ulps(a: float, b: float) -> int:
+    """How many float64 numbers lie from one to the other: 0 for equal bits, 1 for neighbours, and for 0.0 and -0.0."""
+    return abs(_place(a) - _place(b))
+
+
+def _place(value: float) -> int:
+    """A float64's place in the order of all of them."""
+    bits: int = struct.unpack("<q", struct.pack("<d", value))[0]
+    return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF) - 1
 
 
 def shape_text(array: Array) -> str:

@@ -64,6 +64,12 @@ def estimate(node: str) -> str:
     return f"node/{node}/estimate"
 
 
+def data_topics(problem: Problem) -> list[str]:
+    """Every topic that has a message of each step, of a run of this problem: all but events."""
+    names = problem.node_names
+    return [MODE, PLANT_STATE, *map(measurement, names), *map(estimate, names)]
+
+
 def model_of(topic: str) -> type[Message] | None:
     """The model of a topic's messages; None for a key that is not a topic."""
     match topic.split("/"):

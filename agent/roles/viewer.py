@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, MODE, PLANT_STATE, estimate, measurement, model_of
+from agent.contract.keys import COORDINATOR, EVENT, data_topics, model_of
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
 from agent.network.words import ChannelClosed, Words
@@ -66,9 +66,8 @@ def _server(gains: Gains, run: str, host: str, port: int) -> Iterator[tuple[str,
         import foxglove
     except ImportError:
         raise InputError("live needs Foxglove's SDK: pip install 'peakmesh[foxglove]'") from None
-    names, context = gains.problem.node_names, foxglove.Context()
-    topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
-    channels = {topic: _channel(foxglove, topic, context) for topic in topics}
+    context = foxglove.Context()
+    channels = {topic: _channel(foxglove, topic, context) for topic in (*data_topics(gains.problem), EVENT)}
     try:
         server = foxglove.start_server(name=f"peakmesh: {run}", host=host, port=port, context=context)
     except RuntimeError as error:

@@ -7,13 +7,13 @@ happened.
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from agent.contract.arrays import ulps
 from agent.contract.errors import RunBroken
 from agent.contract.keys import EVENT, MODE, PLANT_STATE, decode, model_of
 from agent.contract.recording import Logged
@@ -33,17 +33,6 @@ def compare(a: Path, b: Path) -> Comparison:
         found.damage = first.damage, second.damage
     found.gaps = {at: found.gaps[at] for at in sorted(found.gaps, key=lambda at: (*_order(at[0]), at[1]))}
     return found
-
-
-def ulps(a: float, b: float) -> int:
-    """How many float64 numbers lie from one to the other: 0 for equal bits, 1 for neighbours, and for 0.0 and -0.0."""
-    return abs(_place(a) - _place(b))
-
-
-def _place(value: float) -> int:
-    """A float64's place in the order of all of them."""
-    bits: int = struct.unpack("<q", struct.pack("<d", value))[0]
-    return bits if bits >= 0 else -(bits & 0x7FFF_FFFF_FFFF_FFFF) - 1
 
 
 def _facts(reader: RecordingReader) -> dict[str, Any]:

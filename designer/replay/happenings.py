@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.contract.keys import MODE, PLANT_STATE, estimate, measurement
+from agent.contract.keys import PLANT_STATE, data_topics, estimate, measurement
 from designer.replay.log import Log
 from designer.replay.times import Times
 from designer.replay.verdict import Divergence
@@ -60,8 +60,7 @@ def _substitutions(log: Log, times: Times) -> Iterator[Happening]:
 def _missing(log: Log, times: Times) -> Iterator[Happening]:
     """Messages that are not in the file; of a topic that is not there at all, once."""
     found: list[tuple[int, str, str]] = []
-    names = log.gains.problem.node_names
-    for topic in (MODE, PLANT_STATE, *map(measurement, names), *map(estimate, names)):
+    for topic in data_topics(log.gains.problem):
         steps = times.missing(topic)
         if len(steps) < log.steps or not log.steps:
             found += [(int(step), topic, f"the message of {topic} is not in the file") for step in steps]

@@ -10,16 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from here import here
 from hypothesis import given
 from hypothesis import strategies as st
 from made_recordings import Sent, random_gains, random_problem, real_problem, record, simulate
 from places import GOLDEN
-from runs import end_of, logged, peakmesh
+from runs import end_of, logged
 
+from agent.contract.arrays import ulps
 from agent.contract.gains import Gains
 from agent.contract.recording.reader import RecordingReader
 from agent.contract.recording.writer import RecordingWriter
-from designer.compare import compare, ulps
+from designer.compare import compare
 
 STEPS = 6
 FLOATS = st.floats(allow_nan=False)
@@ -266,12 +268,12 @@ def test_the_command_says_how_far_apart(gains: Gains, sent: list[Sent], tmp_path
     )
     other[number].document["z_hat"][0] = flipped(message.document["z_hat"][0], 3)
     a, b = write(tmp_path / "a.mcap", gains, sent), write(tmp_path / "b.mcap", gains, other)
-    done = peakmesh("compare", a, b)
+    done = here("compare", a, b)
     assert (done.returncode, done.stderr) == (1, "")
     assert done.stdout.startswith(f"{a} and {b}: they differ\n")
     assert "first difference: step 3, node/n2/estimate, z_hat[0]: " in done.stdout
     assert "8 ulp apart" in done.stdout
-    same = peakmesh("compare", a, a, "--json")
+    same = here("compare", a, a, "--json")
     assert same.returncode == 0
     assert json.loads(same.stdout)["identical"] is True
 
@@ -279,7 +281,7 @@ def test_the_command_says_how_far_apart(gains: Gains, sent: list[Sent], tmp_path
 def test_what_is_no_recording_is_refused(gains: Gains, sent: list[Sent], tmp_path: Path) -> None:
     a = write(tmp_path / "a.mcap", gains, sent)
     for other in (tmp_path / "none.mcap", GOLDEN / "zhu2020-lossy.gains.json", tmp_path):
-        done = peakmesh("compare", a, other)
+        done = here("compare", a, other)
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr.startswith("peakmesh: ")
         assert done.stderr.count("\n") == 1

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from here import here
 from made_recordings import Sent, random_gains, real_problem, record, simulate
 from places import GOLDEN, ROOT
-from runs import peakmesh
 from scipy.io import loadmat
 
 from agent.contract.arrays import Array
@@ -186,7 +186,7 @@ def test_what_is_missing_is_not_a_number(to: str, sent: list[Sent], tmp_path: Pa
 def test_a_cut_recording_is_exported_as_far_as_it_goes(sent: list[Sent], tmp_path: Path) -> None:
     half = sent[: len(sent) // 2]
     path = record(tmp_path / "run.mcap", NETWORK, half, steps=STEPS, whole=False)
-    done = peakmesh("export", path, "--csv", "-o", tmp_path / "table.csv")
+    done = here("export", path, "--csv", "-o", tmp_path / "table.csv")
     assert done.returncode == 0
     assert "of the run not in it: NaN in their place" in done.stderr
     assert long(read(tmp_path / "table.csv")) == expected(half)
@@ -258,7 +258,7 @@ def test_the_two_lines_of_the_document_read_it(run: Path, tmp_path: Path, monkey
     commands = re.findall(r"^peakmesh export (.*)$", DOCUMENT, flags=re.MULTILINE)
     assert [sum(map(bool, block.splitlines())) for block in blocks] == [2, 2]  # lines that are not empty
     for command in commands:
-        assert peakmesh("export", *command.partition("#")[0].split(), cwd=tmp_path).returncode == 0
+        assert here("export", *command.partition("#")[0].split(), cwd=tmp_path).returncode == 0
     frames = []
     for block in blocks:
         names: dict[str, Any] = {}
@@ -273,11 +273,11 @@ def test_the_two_lines_of_the_document_read_it(run: Path, tmp_path: Path, monkey
 # bad input
 def test_nothing_is_overwritten_and_nothing_is_left(run: Path, tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("mine")
-    done = peakmesh("export", run, "--csv")
+    done = here("export", run, "--csv")
     assert (done.returncode, done.stdout) == (2, "")
     assert "exists already" in done.stderr
     assert (tmp_path / "run.csv").read_text() == "mine"
-    assert peakmesh("export", run, "--csv", "--force").returncode == 0
+    assert here("export", run, "--csv", "--force").returncode == 0
     assert (tmp_path / "run.csv").read_text().startswith("step,")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.csv", "run.mcap"]
 
@@ -307,14 +307,14 @@ def test_a_table_that_cannot_be_written_leaves_nothing(
     ],
 )
 def test_bad_usage_is_refused(words: list[str], said: str, run: Path, tmp_path: Path) -> None:
-    done = peakmesh("export", run, *words, cwd=tmp_path)
+    done = here("export", run, *words, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert said in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
-    done = peakmesh("export", GOLDEN / "zhu2020-lossy.gains.json", "--csv", "-o", tmp_path / "table.csv")
+    done = here("export", GOLDEN / "zhu2020-lossy.gains.json", "--csv", "-o", tmp_path / "table.csv")
     assert (done.returncode, done.stdout) == (2, "")
     assert "is not a recording" in done.stderr
     assert list(tmp_path.iterdir()) == []

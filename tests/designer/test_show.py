@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 import rewriting
+from here import here
 from made_recordings import random_gains, random_problem, real_problem, record, simulate
 from places import ROOT
-from runs import answer, peakmesh
+from runs import answer
 
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
@@ -140,10 +141,10 @@ def test_an_attachment_is_taken_out(name: str, tmp_path: Path) -> None:
     with GOLDEN.open("rb") as file:
         attached = {found.name: found.data for found in make_reader(file).iter_attachments()}
     assert show.attachment(GOLDEN, name) == attached[name]
-    done = peakmesh("show", GOLDEN, "--get", name, "-o", tmp_path / "out.json", "--json")
+    done = here("show", GOLDEN, "--get", name, "-o", tmp_path / "out.json", "--json")
     assert answer(done) == {"attachment": name, "output": str(tmp_path / "out.json"), "bytes": len(attached[name])}
     assert (tmp_path / "out.json").read_bytes() == attached[name]
-    assert peakmesh("show", GOLDEN, "--get", name).stdout.encode() == attached[name]
+    assert here("show", GOLDEN, "--get", name).stdout.encode() == attached[name]
 
 
 def test_gains_that_were_taken_out_are_the_runs_own(tmp_path: Path) -> None:
@@ -175,7 +176,7 @@ def test_a_layout_that_was_left_out_is_made_anew(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_taken_out_is_refused(words: list[object], said: str, tmp_path: Path) -> None:
-    done = peakmesh("show", *words, cwd=tmp_path)
+    done = here("show", *words, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert said in done.stderr
     assert list(tmp_path.iterdir()) == []

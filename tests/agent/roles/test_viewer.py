@@ -13,6 +13,7 @@ from subprocess import Popen
 from typing import Any
 
 import pytest
+from here import here
 from places import GOLDEN
 from runs import end_of, freeze, line_with, numbers_of, peakmesh, started, thaw
 from websockets import Subprotocol
@@ -162,5 +163,5 @@ def test_a_port_that_is_taken_is_named() -> None:
 @pytest.mark.parametrize("words", [["--port", "70000"], ["--port", "x"], ["--run", "a/b"], ["--connect", "7447"], []])
 def test_bad_usage_is_refused(words: list[str]) -> None:
     given = words if "--connect" in words or not words else [*words, "--connect", "tcp/127.0.0.1:1"]
-    done = peakmesh("live", GAINS, *given)
+    done = here("live", GAINS, *given)
     assert (done.returncode, done.stdout) == (2, "")

@@ -14,12 +14,13 @@ import pytest
 import rewriting
 from foxglove.messages import Event, KeyValuePair, Log, LogLevel, Timestamp
 from foxglove_settings import faults
+from here import here
 from jsonschema import Draft202012Validator
 from made_recordings import Sent, random_gains, random_problem, real_problem, record, simulate
 from mcap.reader import make_reader
 from places import GOLDEN
 from rewriting import merged
-from runs import logged, peakmesh
+from runs import logged
 
 from agent.contract.gains import Gains
 from agent.contract.schedule import Deliveries
@@ -307,16 +308,16 @@ def test_many_divergences_are_counted_and_the_first_written(
 def test_the_command_writes_it_whatever_the_verdict(sent: list[Sent], tmp_path: Path) -> None:
     nudged = simulate(NETWORK, steps=STEPS, nudge=(3, "n1", 1e-3))
     path, output = write(tmp_path, nudged), tmp_path / "audit.mcap"
-    done = peakmesh("replay", path, "--write", output)
+    done = here("replay", path, "--write", output)
     assert done.returncode == 1
     assert f"layer      {output}" in done.stdout
     assert read(output)["audit/step"]
     before = output.read_bytes()
-    again = peakmesh("replay", path, "--write", output)
+    again = here("replay", path, "--write", output)
     assert (again.returncode, again.stdout) == (2, "")
     assert "exists already" in again.stderr
     assert output.read_bytes() == before
-    assert json.loads(peakmesh("replay", path, "--write", output, "--force", "--json").stdout)["written"] == str(output)
+    assert json.loads(here("replay", path, "--write", output, "--force", "--json").stdout)["written"] == str(output)
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["audit.mcap", "run.mcap"]
 
 
@@ -333,7 +334,7 @@ def test_merged_with_it_the_recording_is_what_it_was(sent: list[Sent], tmp_path:
 def test_a_layer_is_no_recording(sent: list[Sent], tmp_path: Path) -> None:
     output = tmp_path / "audit.mcap"
     written(write(tmp_path, sent), output)
-    done = peakmesh("replay", output)
+    done = here("replay", output)
     assert (done.returncode, done.stdout) == (2, "")
     assert "not a recording" in done.stderr
     assert judge(logs.load(tmp_path / "run.mcap")).agrees

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from here import here
 from made_recordings import (
     Sent,
     observer_gains,
@@ -17,7 +18,6 @@ from made_recordings import (
     simulate,
 )
 from places import GOLDEN
-from runs import peakmesh
 
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
@@ -173,14 +173,14 @@ def test_the_command_prints_both(tmp_path: Path) -> None:
         for m, receivers in document["H"].items()
     }
     plain.write_text(json.dumps({"K": document["K"], "H": halved}))
-    done = peakmesh("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", plain)
+    done = here("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", plain)
     assert done.returncode == 0
     verdict, _, other = done.stdout.partition("\n\n")
     assert ": agrees\n" in verdict
     assert other.startswith(f"what if {plain} had run")
     for row in ("peak |z~|", "sum of |z~|^2", "sum of |w|^2", *(f'rms of z~ of node "{name}"' for name in "1234")):
         assert f"\n{row}" in other
-    facts = json.loads(peakmesh("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", plain, "--json").stdout)
+    facts = json.loads(here("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", plain, "--json").stdout)
     assert facts["agrees"] is True
     assert facts["what_if"]["recorded"]["peak"] == pytest.approx(facts["peak"])
     assert facts["what_if"]["energy"] == pytest.approx(facts["energy"])
@@ -190,15 +190,15 @@ def test_the_command_prints_both(tmp_path: Path) -> None:
 def test_gains_of_another_shape_are_refused(tmp_path: Path) -> None:
     other = random_gains(random_problem(1, ny=(1, 1)))
     other.save(tmp_path / "other.json")
-    done = peakmesh("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", tmp_path / "other.json")
+    done = here("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", tmp_path / "other.json")
     assert (done.returncode, done.stdout) == (2, "")
     assert "does not fit zhu2020-lossy" in done.stderr
     assert done.stderr.count("\n") == 1
-    done = peakmesh("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", tmp_path / "none.json")
+    done = here("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", tmp_path / "none.json")
     assert (done.returncode, done.stdout) == (2, "")
 
 
 def test_gains_of_another_problem_are_named_as_such() -> None:
-    done = peakmesh("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", GOLDEN / "zhu2020-ideal.gains.json")
+    done = here("replay", GOLDEN / "zhu2020-lossy.mcap", "--with", GOLDEN / "zhu2020-ideal.gains.json")
     assert done.returncode == 0
     assert "(designed for another problem) had run" in done.stdout
