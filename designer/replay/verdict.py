@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from agent.contract.arrays import ulps
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
 from agent.contract.recording.evidence.examiner import Findings
 from designer.replay.census import Faults
@@ -67,7 +67,7 @@ class Divergence:
         """The distance of the two numbers in units in the last place, counted in float64; None of names."""
         if isinstance(self.logged, str) or isinstance(self.expected, str):
             return None
-        return abs(_ordinal(self.logged) - _ordinal(self.expected))
+        return ulps(self.logged, self.expected)
 
     def text(self) -> str:
         values = (repr(value) if isinstance(value, float) else f'"{value}"' for value in (self.logged, self.expected))
@@ -75,12 +75,6 @@ class Divergence:
 
     def document(self) -> dict[str, Any]:
         return {**vars(self), "ulps": self.ulps}
-
-
-def _ordinal(value: float) -> int:
-    """Its place among all float64."""
-    bits = int.from_bytes(struct.pack(">d", value), "big", signed=True)
-    return bits if bits >= 0 else -(bits & (2**63 - 1))
 
 
 @dataclass(frozen=True)
