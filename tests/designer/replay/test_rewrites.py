@@ -407,7 +407,7 @@ def test_a_cut_file_with_a_tail_of_zeros_is_read_up_to_there(
     path.write_bytes(data[: int(share * len(data))] + bytes(4096))
     verdict = replay(path)
     assert verdict.agrees, verdict.text()
-    if re.search(r"bytes from byte \d+ on are zeros", verdict.damage):
+    if re.search(r"bytes from byte \d+ on are (zeros|no records)", verdict.damage):
         assert (verdict.exit_code, verdict.missing.total) == (3, 0)
     else:
         assert "its index is damaged" in verdict.text()
