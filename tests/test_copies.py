@@ -98,6 +98,8 @@ def examples() -> dict[type, Frozen]:
         messages.Measurement(step=0, y=[1e-300]),
         messages.Estimate(step=1, x_hat=[0.1], innovation=[0.2], z_hat=[0.3], mode="1", heard=["2"]),
         messages.Event(step=0, kind="start", who="coordinator", detail=""),
+        messages.Evidence(step=0, who="plant", first=0, digests="0123abcd--------", head="0" * 32),
+        messages.BrokenOff(reason="the disk is full", steps=3, stop=True),
         messages.Ready(who="node-1", session="a", gains="b"),
         messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
         messages.Acknowledged(
