@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from disks import disk_of
-from runs import PATIENCE, answer, child, decoded, end_of, line_with, peakmesh, started
+from runs import PATIENCE, alone, answer, child, decoded, end_of, line_with, peakmesh, started
 
 from agent.contract.gains import Gains
 from agent.contract.keys import EVENT, EVIDENCE
@@ -28,14 +28,14 @@ def messages_of(*files: Path) -> list[Logged]:
     """All messages of some files, with the evidence."""
     found = list[Logged]()
     for file in files:
-        with RecordingReader(file) as reader:
+        with RecordingReader(alone(file)) as reader:
             found += reader.messages()
     return found
 
 
 def examined(*files: Path) -> Findings:
     messages = messages_of(*files)
-    return examine(((m, decoded(m).step) for m in messages), external=(), end=end_of(files[-1]) or {})
+    return examine(((m, decoded(m).step) for m in messages), external=(), end=end_of(alone(files[-1])) or {})
 
 
 def complete_steps(messages: list[Logged]) -> int:
@@ -70,7 +70,7 @@ def test_a_run_in_parts_has_every_message_once_and_evidence_through_all(pair_pat
     assert len(set(wire)) == len(wire) == facts["messages"] == 1200 * 6 + 2
     assert complete_steps(messages) == 1200
     assert examined(*files) == Findings(len(wire), 0, (), (), ())
-    ends = [end_of(file) or {} for file in files]
+    ends = [end_of(alone(file)) or {} for file in files]
     assert [end["status"] for end in ends] == ["continues"] * (len(files) - 1) + ["finished"]
     assert [int(end["steps"]) for end in ends] == sorted(int(end["steps"]) for end in ends)
 

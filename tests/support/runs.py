@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -94,6 +95,13 @@ def logged(path: Path) -> list[Logged]:
     """All messages of a recording that were on the wire, as far as it goes."""
     with RecordingReader(path) as reader:
         return [message for message in reader.messages() if message.topic != EVIDENCE]
+
+
+def alone(path: Path) -> Path:
+    """A copy of a file in a folder of its own, where nobody finds the other parts beside it."""
+    folder = path.parent.with_name(f"{path.parent.name}-alone") / path.stem
+    folder.mkdir(parents=True, exist_ok=True)
+    return Path(shutil.copy(path, folder))
 
 
 def end_of(path: Path) -> dict[str, str] | None:

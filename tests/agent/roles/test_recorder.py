@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from disks import disk_of
 from made_recordings import random_gains, random_problem, simulate
-from runs import decoded
+from runs import alone, decoded
 
 from agent.contract.errors import RunBroken
 from agent.contract.files import canonical
@@ -127,7 +127,7 @@ def content(*files: Path) -> tuple[list[Logged], dict[str, str]]:
     """All messages of some files, and the last `end` among them."""
     messages, end = list[Logged](), dict[str, str]()
     for file in files:
-        with RecordingReader(file) as reader:
+        with RecordingReader(alone(file)) as reader:
             messages += reader.messages()
             end = reader.end or end
     return messages, end

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from made_recordings import random_gains, random_problem, record, simulate
 from rewriting import Item, read, write
+from runs import alone
 
 from agent.contract.files import canonical
 from agent.contract.keys import EVIDENCE, PLANT_STATE, estimate, measurement
@@ -116,10 +117,14 @@ def test_parts_are_one_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     files = files_of(tmp_path / "run.mcap")
     assert len(files) > 3
     assert (replay(files).exit_code, replay(files[::-1]).evidence.checked) == (0, MESSAGES)
+    assert replay(files[0]).evidence.checked == MESSAGES  # the others stand beside it
+    (tmp_path / "elsewhere").mkdir()
     for at, file in enumerate(files):
-        alone = replay(file)
-        assert (alone.exit_code, alone.evidence.total) == (3, 0)
+        by_itself = replay(alone(file))
+        assert (by_itself.exit_code, by_itself.evidence.total) == (3, 0)
         step = next(json.loads(item.payload)["step"] for item in read(file).items if item.topic == estimate("n1"))
-        others = [*files[:at], *files[at + 1 :]]
-        verdict = replay([*others, changed(file, estimate("n1"), step, next_to)])
+        file.rename(tmp_path / "elsewhere" / file.name)
+        mutant = changed(tmp_path / "elsewhere" / file.name, estimate("n1"), step, next_to)
+        verdict = replay([*files[:at], mutant, *files[at + 1 :]])
         assert [(f.kind, f.number) for f in verdict.evidence.wrong] == [("altered", step)]
+        (tmp_path / "elsewhere" / file.name).rename(file)

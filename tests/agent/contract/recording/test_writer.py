@@ -14,6 +14,7 @@ import pytest
 from disks import disk_of
 from made_recordings import random_gains, random_problem, record, simulate
 from places import ROOT
+from runs import alone
 
 from agent.contract.errors import InputError, RecordingFailed, RunBroken
 from agent.contract.files import canonical
@@ -33,12 +34,13 @@ END = {"status": "finished", "steps": "3"}
 
 
 def messages_of(path: Path) -> list[Logged]:
-    with RecordingReader(path) as reader:
+    """What is in this file."""
+    with RecordingReader(alone(path)) as reader:
         return list(reader.messages())
 
 
 def end_of(path: Path) -> dict[str, str] | None:
-    with RecordingReader(path) as reader:
+    with RecordingReader(alone(path)) as reader:
         list(reader.messages())
         assert reader.damage == ""
         return reader.end
@@ -216,7 +218,7 @@ def test_every_part_is_a_whole_recording_and_says_which_it_is(tmp_path: Path) ->
     """The facts of the run are the same in all, but for the number; each but the last says what it is continued by."""
     parts = split_recording(tmp_path / "run.mcap", Split(size=4000))
     for number, file in enumerate(files_of(tmp_path / "run.mcap"), start=1):
-        with RecordingReader(file) as reader:
+        with RecordingReader(alone(file)) as reader:
             assert reader.gains == GAINS
             assert reader.run["part"] == str(number)
             assert {key: value for key, value in reader.run.items() if key in RUN} == RUN
@@ -411,7 +413,7 @@ def test_a_writer_killed_at_any_moment_leaves_all_that_was_flushed(tmp_path: Pat
             whole = file.suffix == ".mcap"
             unfinished_parts += not whole
             try:
-                with RecordingReader(file) as reader:
+                with RecordingReader(alone(file)) as reader:
                     found += [message.number for message in reader.messages()]
                     assert (reader.end is not None and reader.damage == "") or not whole
             except InputError:  # its head is not there yet
