@@ -69,18 +69,28 @@ class Inbox:
         return self._modes.get(self._step)
 
     @property
+    def neighbours(self) -> list[str]:
+        """The nodes that the present step's mode has this one hear, itself among them."""
+        return self._hears[self._modes[self._step]]
+
+    @property
     def lacking(self) -> str | None:
         """A node whose pair the present step's mode asks for and that is missing; None where all are there."""
         pairs = self._pairs[self._step]
-        return next((sender for sender in self._hears[self._modes[self._step]] if sender not in pairs), None)
+        return next((sender for sender in self.neighbours if sender not in pairs), None)
 
     def heard(self, *, lost: Container[str] = ()) -> dict[str, Pair]:
         """The pairs that the present step's mode asks for, without those of `lost`; all must be there."""
         pairs = self._pairs[self._step]
-        return {sender: pairs[sender] for sender in self._hears[self._modes[self._step]] if sender not in lost}
+        return {sender: pairs[sender] for sender in self.neighbours if sender not in lost}
 
     def next_step(self) -> None:
         """Forget the present step."""
         for kept in (self._measurements, self._modes, self._pairs):
             kept.pop(self._step, None)
         self._step += 1
+
+    def skip_to(self, step: int) -> None:
+        """Forget every step before `step`."""
+        while self._step < step:
+            self.next_step()

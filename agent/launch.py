@@ -22,11 +22,12 @@ from typing import IO, Any, NamedTuple
 from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
-from agent.contract.recording import parts
+from agent.contract.recording.parts import files_of
 from agent.plan import Plan, RecordingPlan
 from agent.signals import heed, restore
 
 RECORDER_SECONDS = 60.0  # after the coordinator has gone, the recorder has so long to close before it is killed
+MOST_REVIVALS, REVIVAL_SECONDS = 3, 10.0  # a role of a paced run is started again so often in so many seconds
 FAREWELL_SECONDS = 1.0  # after the recorder has gone, the others have so long
 
 
@@ -64,10 +65,11 @@ def launch(
     common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
     commands |= {node_who(name): ["node", *common, "--node", name] for name in gains.problem.node_names}
-    commands[PLANT] = ["plant", *common]
+    if not plan.needs_no_plant(gains.problem):
+        commands[PLANT] = ["plant", *common]
     options = _recorder_options(recording_plan or RecordingPlan(), force=force)
     commands[RECORDER] = ["recorder", *common, "--output", str(recording), *options]
-    with _Crew() as crew:
+    with _Crew(survives=plan.pace is not None) as crew:
         for who, command in commands.items():
             crew.start(who, command)
         summary: dict[str, Any] = {}
@@ -76,7 +78,9 @@ def launch(
                 crew.tell_address(word["listening"][0])
             elif "started" in word:
                 crew.started = True
-                summary["start_seconds"] = word["started"] - began
+                summary.setdefault("start_seconds", word["started"] - began)
+            elif "ending" in word:
+                crew.survives = False  # whoever ends now is not needed any more
             elif "summary" in word:
                 summary |= word["summary"]
             report(word)
@@ -84,9 +88,9 @@ def launch(
         try:
             crew.raise_what_happened(finished="steps" in summary)
         except RunBroken as error:
-            kept = parts.files_of(recording)
+            kept = files_of(recording)
             if crew.started and kept:
-                error.args = (f"{error}; what was recorded is in {parts.in_words(kept)}",)
+                error.args = (f"{error}; what was recorded is in {' and '.join(map(str, kept))}",)
             raise
     if "steps" not in summary:
         raise RunBroken("the coordinator ended without a summary")
@@ -97,6 +101,11 @@ def _plan_options(plan: Plan) -> list[str]:
     options = ["--steps", plan.steps, "--seed", plan.seed, "--window", plan.window, "--deadline", plan.deadline]
     for node in plan.external:
         options += ["--external", node]
+    if plan.pace is not None:
+        period, measure_by, hear_by = plan.pace
+        options += ["--period", period, "--measure-by", measure_by, "--hear-by", hear_by]
+    for fault in plan.faults:
+        options += ["--fault", fault]
     return [str(option) for option in options]
 
 
@@ -110,16 +119,20 @@ def _recorder_options(plan: RecordingPlan, *, force: bool) -> list[str]:
 
 
 class _Crew:
-    """The processes of one run."""
+    """The processes of one run. Where it `survives`, who ends early is started again."""
 
-    def __init__(self) -> None:
-        self.started = False
+    def __init__(self, *, survives: bool) -> None:
+        self.started, self.survives = False, survives
+        self._commands: dict[str, list[str]] = {}
+        self._address = ""  # of the coordinator
+        self._revived: dict[str, list[float]] = {}  # when
         self._children: dict[str, Child] = {}
         self._signal: int | None = None
         self._failed: str | None = None  # who ended badly before the run had started
         self._before = heed(self._on_signal) | {signal.SIGCHLD: signal.signal(signal.SIGCHLD, self._on_exit)}
 
     def start(self, who: str, command: list[str]) -> None:
+        self._commands[who] = command
         said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the crew
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "agent", *command],  # -P: no agent.py of the current folder
@@ -133,21 +146,46 @@ class _Crew:
             self._end_run(self._signal)
 
     def words_of_coordinator(self) -> Iterator[dict[str, Any]]:
-        """The lines of the coordinator's stdout, until it ends."""
-        stdout = self._children[COORDINATOR].process.stdout
-        assert stdout is not None
-        for line in stdout:
-            yield json.loads(line)
+        """The lines of the coordinator's stdout, until it ends for good."""
+        while True:
+            process = self._children[COORDINATOR].process
+            assert process.stdout is not None
+            for line in process.stdout:
+                yield json.loads(line)
+            if process.wait() >= 0 or not self._revive(COORDINATOR):  # it ends by itself where the run is over
+                return
 
     def tell_address(self, address: str) -> None:
+        """Tell everybody who does not know it yet where the coordinator listens."""
+        if self._address:
+            return
+        self._address = address
+        self._commands[COORDINATOR] += ["--listen", address]
         for who, child in self._children.items():
             if who != COORDINATOR:
-                assert child.process.stdin is not None
-                try:
-                    child.process.stdin.write(f"{address}\n".encode())
-                    child.process.stdin.flush()
-                except BrokenPipeError:  # it has ended already; _on_exit sees to that
-                    continue
+                self._tell(child)
+
+    def _tell(self, child: Child) -> None:
+        assert child.process.stdin is not None
+        try:
+            child.process.stdin.write(f"{self._address}\n".encode())
+            child.process.stdin.flush()
+        except BrokenPipeError:  # it has ended already; _on_exit sees to that
+            return
+
+    def _revive(self, who: str) -> bool:
+        """Start somebody again who has ended; False where that is not to be, or has been tried too often."""
+        times = [time.monotonic(), *self._revived.get(who, [])]
+        if not (self.started and self.survives) or self._signal is not None:
+            return False
+        if len(times) > MOST_REVIVALS and times[0] - times[MOST_REVIVALS] < REVIVAL_SECONDS:
+            return False
+        self._revived[who] = times
+        self._let_go(self._children[who])
+        self.start(who, self._commands[who])
+        if who != COORDINATOR:
+            self._tell(self._children[who])
+        return True
 
     def wait(self) -> None:
         """Until all have ended, the recorder first; who lingers is killed, at once where nothing was recorded yet."""
@@ -192,6 +230,11 @@ class _Crew:
 
     def _on_exit(self, number: int, frame: FrameType | None) -> None:
         coordinator = self._children.get(COORDINATOR)
+        if self.started and self.survives:
+            for who, child in list(self._children.items()):
+                if who != COORDINATOR and child.process.poll() is not None:
+                    self._revive(who)
+            return
         if self.started or self._failed is not None or coordinator is None or coordinator.process.poll() is not None:
             return
         for who, child in self._children.items():
@@ -204,6 +247,13 @@ class _Crew:
         if COORDINATOR in self._children:
             self._children[COORDINATOR].process.send_signal(number)
 
+    @staticmethod
+    def _let_go(child: Child) -> None:
+        child.process.wait()
+        for stream in (child.process.stdin, child.process.stdout, child.said):
+            if stream is not None:
+                _close(stream)
+
     def __enter__(self) -> _Crew:
         return self
 
@@ -211,10 +261,7 @@ class _Crew:
         for child in self._children.values():
             if child.process.poll() is None:
                 child.process.kill()
-            child.process.wait()
-            for stream in (child.process.stdin, child.process.stdout, child.said):
-                if stream is not None:
-                    _close(stream)
+            self._let_go(child)
         restore(self._before)
 
 

@@ -10,16 +10,20 @@ from agent.contract.problem import Problem
 
 
 class Receipts:
-    """Counts messages by sender, and the steps of which every message is there."""
+    """Counts messages by sender, and the steps of which every message is there.
 
-    def __init__(self, problem: Problem) -> None:
+    In a `paced` run nothing but the mode has to be: whoever is not there does not hold the others up.
+    """
+
+    def __init__(self, problem: Problem, *, paced: bool = False) -> None:
         names = problem.node_names
-        self._topics = (MODE, PLANT_STATE, *map(measurement, names), *map(estimate, names))
+        self._topics = (MODE,) if paced else (MODE, PLANT_STATE, *map(measurement, names), *map(estimate, names))
         self._there: defaultdict[int, set[str]] = defaultdict(set)  # topics of the incomplete steps
         self._early: defaultdict[str, set[int]] = defaultdict(set)  # numbers that came before their turn
         self.complete = 0  # every message of the steps below is there
         self.messages = 0  # taken
         self.received: dict[str, int] = {}  # of each sender, the messages without a gap
+        self.lost: dict[str, int] = {}  # of each sender, messages that went with a process before this one
         self.reached: dict[str, int] = {}  # of each sender, the last step seen
 
     def take(self, topic: str, step: int, stamp: Stamp | None) -> bool:
@@ -43,8 +47,16 @@ class Receipts:
 
     def missing(self, sender: str) -> int:
         """How many messages of a sender are missing before the last one of theirs that is there."""
-        early = self._early.get(sender)
-        return max(early) - self.received.get(sender, 0) - len(early) + 1 if early else 0
+        early, lost = self._early.get(sender), self.lost.get(sender, 0)
+        return lost + (max(early) - self.received.get(sender, 0) - len(early) + 1 if early else 0)
+
+    def close_gap(self, sender: str) -> None:
+        """Expect the number after the last one that is there: whoever used those before is gone."""
+        early = self._early[sender]
+        if early:
+            self.lost[sender] = self.lost.get(sender, 0) + self.missing(sender)
+            self.received[sender] = max(early) + 1
+            early.clear()
 
     def _number(self, sender: str, number: int) -> bool:
         expected, early = self.received.get(sender, 0), self._early[sender]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from agent.contract.errors import InputError
-from agent.plan import LARGEST_WINDOW, Plan, RecordingPlan
+from agent.plan import LARGEST_WINDOW, Pace, Plan, RecordingPlan
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -45,6 +45,23 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NODE",
         help="the measurements of this node come from a sensor, not from the simulated plant; may be repeated",
+    )
+    parser.add_argument(
+        "--period", type=_period, metavar="TIME", help="one step every TIME, such as 20ms; what is late is substituted"
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="that a paced run is to survive, such as kill:node=2,step=100, freeze:node=3,step=50,for=2s, "
+        "mute-link:1>3,steps=50-80, delay:node=2,by=30ms, drop:probability=0.05; may be repeated",
+    )
+    parser.add_argument(
+        "--measure-by", type=_part, default=0.4, metavar="PART", help="of a period, to wait for a measurement (0.4)"
+    )
+    parser.add_argument(
+        "--hear-by", type=_part, default=0.8, metavar="PART", help="of a period, to wait for what nodes hear (0.8)"
     )
 
 
@@ -97,7 +114,7 @@ def positive(text: str) -> float:
 
 
 _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-_SECONDS = {"": 1, "s": 1, "min": 60, "h": 3600}
+_SECONDS = {"ms": 1e-3, "": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 def _size(text: str) -> int:
@@ -114,10 +131,24 @@ def _duration(text: str) -> float:
     return seconds
 
 
-def _with_unit(text: str, units: Mapping[str, int]) -> float:
+def _period(text: str) -> float:
+    seconds = _with_unit(text, _SECONDS)
+    if not 1e-3 <= seconds <= 3600.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a time from 1ms to 1h, such as 20ms or 0.5s")
+    return seconds
+
+
+def _with_unit(text: str, units: Mapping[str, float]) -> float:
     """A number with one of the units; 0 for anything else."""
     found = re.fullmatch(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?([a-z]*)", text.lower())
     return float(found[1]) * units[found[2]] if found and found[2] in units else 0.0
+
+
+def _part(text: str) -> float:
+    part = _with_unit(text, {"": 1.0})
+    if not 0.0 < part <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a part of a period, above 0 and at most 1")
+    return part
 
 
 def _whole(text: str, *, least: int, most: int) -> int:
@@ -159,7 +190,20 @@ def plan_of(options: argparse.Namespace, gains: Gains) -> Plan:
     most = (2**32 - 1) // (gains.problem.n + 1) - 1  # the plant's messages are numbered in 32 bits
     if options.steps > most:
         raise InputError(f"--steps {options.steps}: a recording of {gains.problem.n} nodes holds at most {most}")
-    return Plan(options.steps, options.seed, options.window, options.deadline, tuple(options.external))
+    pace = None
+    if options.period is not None:
+        pace = Pace(options.period, options.measure_by, options.hear_by)
+        if pace.measure_by >= pace.hear_by:
+            raise InputError(f"--measure-by {pace.measure_by:g} must be less than --hear-by {pace.hear_by:g}")
+    if options.fault and pace is None:
+        raise InputError(f"--fault {options.fault[0]}: a lock-step run survives nothing; --period makes it a paced one")
+    if options.fault:
+        from agent.faults import parse
+
+        for text in options.fault:
+            parse(text, gains.problem, steps=options.steps)
+    external, faults = tuple(options.external), tuple(options.fault)
+    return Plan(options.steps, options.seed, options.window, options.deadline, external, pace, faults)
 
 
 def default_recording(run: str) -> Path:

@@ -113,14 +113,14 @@ def coordinator_command(options: argparse.Namespace) -> int:
     with Bus(_network(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
         say({"listening": bus.locators()})
         summary = coordinator.run(bus, gains, plan, report=say)
-    say({"summary": summary._asdict()})
+    say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
     return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
 
 
 def recorder_command(options: argparse.Namespace) -> int:
     """`peakmesh recorder GAINS -o FILE`."""
     from agent.contract.keys import RECORDER
-    from agent.contract.recording import parts
+    from agent.contract.recording.parts import files_of
     from agent.network.bus import Bus
     from agent.roles import recorder
 
@@ -129,7 +129,7 @@ def recorder_command(options: argparse.Namespace) -> int:
     path = options.output or default_recording(run)
     with Bus(_network(options), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
-    print(f"recording  {parts.in_words(parts.files_of(path))}")
+    print(f"recording  {' '.join(map(str, files_of(path)))}")
     return EXIT_GOOD
 
 

@@ -74,16 +74,31 @@ def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], No
 
 def run_text(result: dict[str, Any]) -> str:
     """The facts of a run, for people."""
-    from agent.contract.recording.parts import in_words
-
-    files = result["parts"] or [result["recording"]]
+    first, *more = result["parts"] or [result["recording"]]
     lines = [
         f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
         f"{result['missing']} missing",
         f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s",
-        f"recording  {in_words(files)}",
-        f"next       peakmesh replay {files[0]}",  # it finds the other parts beside it
+        f"recording  {first}" + (f" and {len(more)} more, to {more[-1]}" if more else ""),
+        f"next       peakmesh replay {first}",  # it finds the other parts beside it
     ]
     if result["broken_off"]:
         lines.insert(1, f"NOT RECORDED TO THE END: {result['broken_off']}")
+    if "pacing" in result:
+        lines[1:1] = pacing_text(result["pacing"])
     return "\n".join(lines)
+
+
+def pacing_text(pacing: dict[str, Any]) -> list[str]:
+    """How a paced run kept time, for people."""
+    asked = pacing["pairs"]
+    part = f" ({pacing['pairs_substituted'] / asked:.2%})" if asked else ""
+    lines = [
+        f"period {1e3 * pacing['period']:g} ms: {pacing['pairs_substituted']} of {asked} pairs substituted{part}, "
+        f"{pacing['measurements_substituted']} measurements, {pacing['late']} messages late"
+    ]
+    for what, words in (("estimate", "measurement to estimate"), ("step", "tick to step")):
+        if pacing["accounts"]:
+            times = (f"{1e3 * pacing[f'to_{what}_{which}']:.2f}" for which in ("median", "p99", "max"))
+            lines.append("{}: median {} ms, 99 % {} ms, most {} ms".format(words, *times))
+    return lines

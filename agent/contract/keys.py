@@ -9,13 +9,16 @@ Keys are `peakmesh/<run>/<topic>`. Messages of the data topics are recorded as t
 | node/<n>/measurement   | Measurement | plant, or a sensor driver  | node n, recorder                           |
 | node/<n>/estimate      | Estimate    | node n                     | nodes that hear n in some mode, recorder   |
 | event                  | Event       | anyone                     | recorder, watchers                         |
+| account                | Account     | nodes of a paced run       | coordinator, recorder                      |
 
 Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<n>, coordinator or recorder:
 
 | topic                  | what        | from                       | to                                         |
 |------------------------|-------------|----------------------------|--------------------------------------------|
 | alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
-| ready/<who>            | Ready       | everyone but sensors       | coordinator: it has seen all the others    |
+| session/<who>/<id>     | liveliness  | everyone but sensors       | <who>: is it there twice?                  |
+| refused/<id>           | a sentence  | everyone but sensors       | session <id>: its place is taken           |
+| ready/<who>            | Ready       | everyone but sensors       | coordinator, recorder: it has seen others  |
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
@@ -39,7 +42,7 @@ from collections.abc import Container
 from pydantic import ValidationError
 
 from agent.contract.errors import RunBroken, first_fault
-from agent.contract.messages import Estimate, Event, Evidence, Measurement, Message, Mode, PlantState
+from agent.contract.messages import Account, Estimate, Event, Evidence, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
 
 
@@ -53,7 +56,7 @@ def topic_of(key_expression: str) -> str:
 
 
 # data
-MODE, PLANT_STATE, EVENT, EVIDENCE = "mode", "plant/state", "event", "evidence"
+MODE, PLANT_STATE, EVENT, ACCOUNT, EVIDENCE = "mode", "plant/state", "event", "account", "evidence"
 
 
 def measurement(node: str) -> str:
@@ -85,6 +88,8 @@ def model_of(topic: str) -> type[Message] | None:
             return Event
         case ["evidence"]:
             return Evidence
+        case ["account"]:
+            return Account
     return None
 
 
@@ -105,6 +110,14 @@ CONTROL, ACKNOWLEDGED = "control", "acknowledged"
 
 def alive(who: str) -> str:
     return f"alive/{who}"
+
+
+def session(who: str, identity: str) -> str:
+    return f"session/{who}/{identity}"
+
+
+def refused(identity: str) -> str:
+    return f"refused/{identity}"
 
 
 def ready(who: str) -> str:
@@ -139,9 +152,9 @@ def sender_of(topic: str, *, external: Container[str] = ()) -> str:
             return node_who(name)
         case ["node", name, "measurement"] if name in external:
             return sensor_who(name)
-        case ["mode"] | ["event"]:
-            return COORDINATOR
-    return PLANT
+        case ["plant", "state"] | ["node", _, "measurement"]:
+            return PLANT
+    return COORDINATOR
 
 
 def participants(problem: Problem) -> list[str]:

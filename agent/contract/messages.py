@@ -24,8 +24,8 @@ class Message(Frozen):
     step: int = Field(ge=0, lt=2**63, description="k, counted from 0: messages belong together by it, never by time")
 
     def encode(self) -> bytes:
-        """JSON; every float64 comes back bit for bit."""
-        return self.__pydantic_serializer__.to_json(self)
+        """JSON; every float64 comes back bit for bit. A field with a default is left out where it has that value."""
+        return self.__pydantic_serializer__.to_json(self, exclude_defaults=True)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -68,6 +68,10 @@ class Estimate(Message):
     A node that sees its losses has y_i(k) - C_i x_hat_i(k) for its innovation, and zeros where nothing arrived.
     z_hat_i(k) = M x_hat_i(k). `mode` and `heard` say how x_hat_i(k) was made: the mode of step k - 1 and the
     nodes whose messages of step k - 1 went into it; at step 0, where x_hat is the initial 0, "" and [].
+
+    Paced runs alone have the rest. `measured` is false where y_i(k) was not there in time: innovation_i(k) is 0.
+    `origin` says where x_hat_i(k) is from where a node begins again: a node, whose x_hat_j(k) it is, or ZERO_STATE;
+    then `mode` is "" and `heard` [] as at step 0.
     """
 
     x_hat: list[float] = Field(description=f"x_hat_i(k), the node's estimate of x(k), nx numbers; {_UNIT}")
@@ -75,14 +79,48 @@ class Estimate(Message):
     z_hat: list[float] = Field(description=f"z_hat_i(k) = M x_hat_i(k), its estimate of z(k), nz numbers; {_UNIT}")
     mode: str = Field(description='the mode of step k - 1, by which x_hat was made; "" at step 0')
     heard: list[str] = Field(description="the nodes whose messages of step k - 1 went into x_hat; [] at step 0")
+    measured: bool = Field(default=True, description="whether y_i(k) was there in time; in lock-step it always is")
+    origin: str = Field(default="", description="where x_hat is from, where the node begins again in a paced run")
+
+
+ZERO_STATE = "the zero state"  # no node has such a name
+LATE, SILENT, GONE = "late", "silent", "gone"  # kinds of events: why their `about` was substituted
 
 
 class Event(Message):
-    """Something worth knowing: `kind` (a word), `who` it is about, `detail` in words."""
+    """Something worth knowing: `kind` (a word), `who` says it, `detail` in words.
+
+    In paced runs events also say what became of messages: `about` is a topic or a participant, `steps` are those of
+    which it is said, `seconds` by how much each of them was late, where that is known.
+    """
 
     kind: str = Field(description="what happened, in a word")
     who: str = Field(description="whom it is about: coordinator, plant, recorder, node-<name> or sensor-<name>")
     detail: str = Field(description="what happened, in words")
+    about: str = Field(default="", description="in a paced run: the topic or the participant that it is said of")
+    steps: list[int] = Field(default=[], max_length=1024, description="and the steps")
+    seconds: list[float] = Field(default=[], max_length=1024, description="by how much each of them was late, in s")
+
+
+class Account(Message):
+    """What node `who` did in a paced run up to step k: once soon after its beginning, and at its end.
+
+    Latencies are from a measurement's arrival to the estimate with it, and from a tick to the next estimate.
+    """
+
+    who: str = Field(description="the node, as node-<name>")
+    steps: int = Field(description="steps that it made")
+    pairs: int = Field(description="messages of neighbours that it was to use")
+    pairs_substituted: int = Field(description="those of them that were not there in time")
+    measurements_substituted: int = Field(description="measurements that were not there in time")
+    late: int = Field(description="messages that came after their deadline")
+    processor: float = Field(default=0.0, description="processor time of the process, in s")
+    to_estimate_median: float = Field(description="from measurement to estimate, in s: half take no longer")
+    to_estimate_p99: float = Field(description="99 of 100 take no longer, in s")
+    to_estimate_max: float = Field(description="none took longer, in s")
+    to_step_median: float = Field(description="from tick to step, in s: half take no longer")
+    to_step_p99: float = Field(description="99 of 100 take no longer, in s")
+    to_step_max: float = Field(description="none took longer, in s")
 
 
 class Evidence(Message):
@@ -100,11 +138,19 @@ class Evidence(Message):
 
 
 class Ready(Frozen):
-    """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains."""
+    """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains.
+
+    Said again to a coordinator that has come back, `underway`: `step` is the first of which `who` has had no mode. Said
+    to the recorder, it `asks` for a greeting.
+    """
 
     who: str
     session: str
     gains: str
+    underway: bool = False
+    asks: bool = False
+    step: int = 0
+    identity: str = ""  # of the run that it has seen begin
 
 
 class Control(Frozen):
@@ -112,6 +158,10 @@ class Control(Frozen):
 
     "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`.
     `external` names the nodes whose measurements come from a sensor, not from the simulated plant.
+
+    A paced run has a `period` in seconds, 0 in lock-step. From a step's mode on a node waits for its measurement for
+    `measure_by` and for its neighbours' pairs for `hear_by` of a period. `faults` are what it is to survive. Who joins
+    while it goes on is told to "start" too: `step` is the next one.
     """
 
     order: Literal["start", "close", "stop"]
@@ -120,6 +170,13 @@ class Control(Frozen):
     window: int
     external: list[str]
     reason: str
+    period: float = 0.0
+    measure_by: float = 0.0
+    hear_by: float = 0.0
+    step: int = 0
+    gains: str = ""
+    identity: str = ""  # of this run alone, though others have its name
+    faults: list[str] = Field(default=[])
 
 
 class BrokenOff(Frozen):
@@ -152,6 +209,7 @@ class Acknowledged(Frozen):
     lacking: list[str]
     closed: bool
     broken_off: BrokenOff | None = None
+    greets: str = ""  # who has just joined: `received` holds the number of their next message
 
 
 class Stamp(NamedTuple):

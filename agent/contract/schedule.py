@@ -18,7 +18,7 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
 
-MODES, LOSSES, DISTURBANCE, DELIVERIES = 1, 2, 3, 4  # the streams
+MODES, LOSSES, DISTURBANCE, DELIVERIES, FAULTS = 1, 2, 3, 4, 5  # the streams
 _BLOCK = 256  # steps drawn at once; results do not depend on it
 _WORDS = 4  # 64-bit words that one count of Philox gives
 

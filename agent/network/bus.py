@@ -16,25 +16,38 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Set
 from types import FrameType, TracebackType
-from typing import Self, TypeVar
+from typing import NoReturn, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from agent.contract.errors import InputError, Interrupted, RunBroken, first_fault
-from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, RECORDER, in_words, model_of, ready
+from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, RECORDER, in_words, model_of, ready, refused
 from agent.contract.messages import Acknowledged, Control, Estimate, Message, Ready
 from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
-from agent.network.words import Incoming, Peer, Replayed, RunClosed, Sample, Words
+from agent.network.words import (
+    Incoming,
+    Namesake,
+    Orphaned,
+    Peer,
+    Refused,
+    Replayed,
+    RunClosed,
+    Sample,
+    UnderWay,
+    Words,
+)
 from agent.signals import heed, restore
 
 # Seconds of silence that end a wait. Silence, because on a busy machine everything takes long, but goes on.
 REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
 CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
 LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
+GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
+ASK_SECONDS = 0.15  # and asks again
 
 T = TypeVar("T")
 Word = TypeVar("Word", Control, Acknowledged, Ready)
@@ -53,6 +66,12 @@ class Bus:
         self._expected: set[str] = set()  # who takes part
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
+        self._ready: Ready | None = None  # what we have told the coordinator
+        self.has_begun = False  # the run, for us
+        self.patient = False  # in a paced run: a coordinator that is lost may come back
+        self._given_up = math.inf  # when it is not waited for any more
+        self.step = 0  # of a paced run: the first of which we have had no mode
+        self.identity = ""  # of the run
         self._session = Session(network, run=run, hand_over=self._words.put)
         self._handlers = heed(self._on_signal)
 
@@ -71,6 +90,11 @@ class Bus:
         """The addresses at which others can connect."""
         return self._session.locators()
 
+    @property
+    def present(self) -> Set[str]:
+        """Who takes part just now."""
+        return self._words.present
+
     # Declare: first what we receive, then what we send, the token last.
     def channel(self, topic: str) -> Channel:
         """Receive a topic's messages."""
@@ -85,14 +109,25 @@ class Bus:
 
     def enter(self) -> None:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
-        if self.who == COORDINATOR:
+        if self.who in (COORDINATOR, RECORDER):
             self._listen(ready("*"), Ready)
-        else:
+        if self.who != COORDINATOR:
             self._listen(CONTROL, Control)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
+        self._session.listen(refused(self._session.identity), _refuse)
         self._session.watch()
+        self._session.watch_namesakes(self.who)
         self._session.appear(self.who)
+
+    def _heed_namesake(self, identity: str) -> None:
+        """Of two processes with one name the one stays that has begun, else the earlier one. Raises Refused."""
+        own = self._session.identity
+        sentence = f'{in_words(self.who)} takes part in run "{self.run}" already; start it once'
+        if identity != own and self.has_begun:
+            self._session.say(refused(identity), sentence.encode())
+        elif identity < own:
+            raise Refused(sentence)
 
     def _listen(self, topic: str, model: type[Word], *, heed: Callable[[Word], None] = lambda word: None) -> None:
         def decode(payload: bytes) -> Word:
@@ -136,7 +171,44 @@ class Bus:
 
     def report_ready(self, gains: str) -> None:
         """Tell the coordinator that we have met everybody, and which gains we run on."""
-        self._say(ready(self.who), Ready(who=self.who, session=self._session.identity, gains=gains))
+        self._ready = Ready(who=self.who, session=self._session.identity, gains=gains)
+        self._say(ready(self.who), self._ready)
+
+    def gather_underway(self, first: Ready, *, seconds: float) -> dict[str, Ready]:
+        """The coordinator's who has come back: what those say who answer in time, after the first."""
+        answers, others, deadline = {first.who: first}, list[Incoming](), time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            match self._words.next(deadline):
+                case Ready(underway=True) as answer:
+                    answers[answer.who] = answer
+                case None:
+                    pass
+                case word:
+                    others.append(word)
+        for word in others:
+            self._words.set_aside(word)
+        return answers
+
+    def greeted(
+        self, *, seconds: float = GREET_SECONDS, heed: Callable[[Incoming | None], None] = lambda word: None
+    ) -> Acknowledged:
+        """Wait for the recorder's word on which number our next message has; RunBroken where it does not come.
+
+        `heed` gets what else is heard.
+        """
+        deadline = time.monotonic() + seconds
+        asks = Ready(who=self.who, session=self._session.identity, gains="", asks=True)
+        while time.monotonic() < deadline:
+            self._say(ready(self.who), asks)  # until it is heard: the recorder may be on its way back, too
+            again = time.monotonic() + ASK_SECONDS
+            while (left := again - time.monotonic()) > 0.0:
+                match self.receive(timeout=left):
+                    case Acknowledged(greets=who) as greeting if who == self.who:
+                        self._outbox.go_on(greeting.received.get(self.who, 0))
+                        return greeting
+                    case word:
+                        heed(word)
+        raise RunBroken(f"the recorder did not greet {in_words(self.who)} within {seconds:g} s; start it again")
 
     def wait_for_start(self) -> Control:
         """The coordinator's order to start, with the facts of the run."""
@@ -157,6 +229,13 @@ class Bus:
             match word:
                 case Control(order="close" | "stop"):
                     raise RunClosed(word)
+                case Control(step=step) if kind is not Control and step:
+                    raise UnderWay(word)
+                case Namesake(identity=identity):
+                    self._heed_namesake(identity)
+                    continue
+                case Ready(underway=True):
+                    raise Orphaned(word)
                 case Peer(who=who, present=False) if who in self._expected:
                     left = left or f"{in_words(who)} left before the run had started"
                     deadline = min(deadline, time.monotonic() + (0.0 if self.who == COORDINATOR else LEAVE_SECONDS))
@@ -188,14 +267,26 @@ class Bus:
         """
         deadline = time.monotonic() + timeout
         while True:
-            word = self._words.next(deadline)
+            word = self._words.next(min(deadline, self._given_up))
+            if time.monotonic() >= self._given_up:
+                raise RunBroken(f"the coordinator was lost, and did not come back within {self.network.wait:g} s")
             match word:
                 case Control(order="close" | "stop"):
                     raise RunClosed(word)
+                case Namesake(identity=identity):
+                    self._heed_namesake(identity)
+                    continue
+                case Peer(who="coordinator", present=present) if self.patient and self._ready is not None:
+                    self._given_up = math.inf if present else time.monotonic() + self.network.wait
+                    if present:
+                        self._say(ready(self.who), self._ready.model_copy(update=self._underway()))
                 case Peer(who="coordinator", present=False):
                     raise RunBroken("the coordinator was lost: its process ended, or the network to it failed")
             if word is not None or time.monotonic() >= deadline:
                 return word
+
+    def _underway(self) -> dict[str, object]:
+        return {"underway": True, "step": self.step, "identity": self.identity}
 
     def fail(self, error: BaseException) -> None:
         """Have the main thread raise `error`; called by the thread that computes."""
@@ -203,6 +294,7 @@ class Bus:
 
     def order(self, control: Control) -> None:
         """The coordinator's word to everybody."""
+        self.has_begun = self.has_begun or control.order == "start"
         self._say(CONTROL, control)
 
     def acknowledge(self, acknowledged: Acknowledged) -> None:
@@ -256,6 +348,10 @@ class Bus:
     def _interrupt(self, number: int) -> None:
         if not self._leaving:
             raise Interrupted(number)
+
+
+def _refuse(sentence: bytes) -> NoReturn:
+    raise Refused(sentence.decode(errors="replace"))
 
 
 def _raise(error: BaseException) -> None:

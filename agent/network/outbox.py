@@ -37,6 +37,10 @@ class Outbox:
         self._kept.append(sent)
         return sent
 
+    def go_on(self, number: int) -> None:
+        """Number what follows from here on: a process before this one has used the numbers below."""
+        self._number = number
+
     def since(self, first: int) -> Iterator[Sent]:
         """What is kept, from number `first` on."""
         return (sent for sent in tuple(self._kept) if sent.stamp.number >= first)

@@ -7,17 +7,18 @@ is handed over as a duty, for the main thread to do.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import alive, key, replay, topic_of, watch
+from agent.contract.keys import alive, key, replay, session, topic_of, watch
 from agent.contract.messages import Stamp
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
-from agent.network.words import ChannelClosed, Duty, Incoming, Peer, Replayed, Sample
+from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, Replayed, Sample
 from agent.plan import LARGEST_WINDOW
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
@@ -58,7 +59,8 @@ class Session:
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._zenoh = _open(network)
-        self.identity = str(self._zenoh.zid())
+        self._zid = str(self._zenoh.zid())
+        self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first
 
     # Data: messages of a topic, and what was missed of them.
     def channel(self, topic: str) -> Channel:
@@ -148,14 +150,26 @@ class Session:
         liveliness = self._zenoh.liveliness()
         self._declared.append(liveliness.declare_subscriber(key(self._run, alive("*")), see, history=True))
 
+    def watch_namesakes(self, who: str) -> None:
+        """Hear of every session of `who`, as Namesake."""
+
+        def see(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                identity = str(sample.key_expr).rpartition("/")[2]
+                self._hand_over(lambda: Namesake(identity))
+
+        liveliness = self._zenoh.liveliness()
+        self._declared.append(liveliness.declare_subscriber(key(self._run, session(who, "*")), see, history=True))
+
     def appear(self, who: str) -> None:
-        """Show the token of `who`, until this session is closed or its process ends."""
-        self._declared.append(self._zenoh.liveliness().declare_token(key(self._run, alive(who))))
+        """Show the tokens of `who`, until this session is closed or its process ends."""
+        for topic in (session(who, self.identity), alive(who)):
+            self._declared.append(self._zenoh.liveliness().declare_token(key(self._run, topic)))
 
     # The session itself.
     def locators(self) -> list[str]:
         """The addresses at which it can be reached."""
-        for reply in self._zenoh.get(f"@/{self.identity}/peer"):
+        for reply in self._zenoh.get(f"@/{self._zid}/peer"):
             if reply.ok is not None:
                 return list(json.loads(reply.ok.payload.to_bytes())["locators"])
         raise RunBroken("zenoh does not tell its own address")

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
+from agent.contract.errors import InputError
 from agent.contract.messages import Acknowledged, Control, Ready, Stamp
 
 
@@ -29,13 +30,19 @@ class Peer(NamedTuple):
     present: bool
 
 
+class Namesake(NamedTuple):
+    """A session of somebody with our name, ours among them."""
+
+    identity: str
+
+
 class Replayed(NamedTuple):
     """The answers of `who` to a request for replay are complete."""
 
     who: str
 
 
-Incoming = Sample | Peer | Control | Acknowledged | Ready | Replayed
+Incoming = Sample | Peer | Namesake | Control | Acknowledged | Ready | Replayed
 Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
 T = TypeVar("T")
 
@@ -46,6 +53,26 @@ class RunClosed(Exception):
     def __init__(self, control: Control) -> None:
         super().__init__(control.reason)
         self.control = control
+
+
+class UnderWay(Exception):
+    """Raised while others are waited for: the run has begun without us."""
+
+    def __init__(self, start: Control) -> None:
+        super().__init__()
+        self.start = start
+
+
+class Orphaned(Exception):
+    """Raised at a coordinator that waits for others: the run has begun, and `ready` was in it."""
+
+    def __init__(self, ready: Ready) -> None:
+        super().__init__()
+        self.ready = ready
+
+
+class Refused(InputError):
+    """Our place is taken: another process has our name in this run."""
 
 
 class ChannelClosed(Exception):
@@ -78,11 +105,14 @@ class Words:
         except Empty:
             return None
         self.taken += 1
-        if word is not None and not (isinstance(word, Peer) and word.who == self._who):
+        is_own = isinstance(word, Namesake) or (isinstance(word, Peer) and word.who == self._who)
+        if word is not None and not is_own:
             self.alone = False
         match word:
             case Peer(who=who, present=True):
                 self.present.add(who)
+            case Peer(who=who) if is_own:
+                return None  # a namesake has gone; we have not
             case Peer(who=who):
                 self.present.discard(who)
         return word

@@ -3,24 +3,38 @@
 Lock-step: mode k goes out once the recorder holds all of step k - window. Neither plant nor chain depends on
 the nodes, so they may run ahead; the numbers never depend on the window. Waiting for the recorder, not for the
 nodes, makes a slow recorder slow the run instead of losing from it.
+
+Paced: mode k goes out when it is due, whoever is there, and nobody can hold the run up.
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 from agent.contract.errors import InputError, PeakmeshError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, MODE, RECORDER, in_words, participants, sensor_who
-from agent.contract.messages import Acknowledged, BrokenOff, Control, Event, Mode
+from agent.contract.keys import (
+    COORDINATOR,
+    EVENT,
+    MODE,
+    PLANT,
+    RECORDER,
+    in_words,
+    participants,
+    sensor_who,
+)
+from agent.contract.messages import GONE, Acknowledged, BrokenOff, Control, Event, Mode, Ready
 from agent.contract.schedule import modes
 from agent.network.bus import Bus
-from agent.network.words import Peer
+from agent.network.words import Incoming, Orphaned, Peer, Refused
 from agent.plan import Plan
+from agent.roles.timekeeper import Timekeeper
 
 REPORT_SECONDS = 0.1
+TAKE_UP_SECONDS = 0.5  # a coordinator that has come back waits so long for others than the first who answers
 
 
 class Summary(NamedTuple):
@@ -32,9 +46,11 @@ class Summary(NamedTuple):
     missing: int
     recorded_steps: int  # all, unless the recording broke off
     broken_off: str  # why, and since when there is no recording; "" where there is a whole one
+    pacing: dict[str, Any] | None = None  # of a paced run: what was substituted, and latencies in seconds
 
 
-# what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}, {"broken_off": sentence}
+# what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}, {"broken_off": sentence},
+# {"ending": why}
 Word = dict[str, Any]
 
 
@@ -53,13 +69,20 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
     signal; in all cases the others have been told, and the recorder has closed the recording.
     """
     bus.advertise([MODE, EVENT])
-    conductor = Conductor(bus, gains, plan, report)
+    conductor, timekeeper = Conductor(bus, gains, plan, report), None
+    if plan.pace is not None:
+        timekeeper = Timekeeper(bus, gains, plan, heed=conductor.heed, stood=conductor.stood)
     try:
         conductor.start()
         report({"started": time.time()})
-        started = time.monotonic()
-        conductor.give_out_modes()
+        started, before = time.monotonic(), conductor.complete
+        if timekeeper is None:
+            conductor.give_out_modes()
+        else:
+            conductor.keep_time(timekeeper)
         seconds = time.monotonic() - started
+    except Refused:
+        raise  # the run is another coordinator's: not ours to stop
     except PeakmeshError as error:
         last_word = conductor.stop(str(error))
         if isinstance(error, Lost) and last_word is not None and error.who in last_word.reached:
@@ -72,11 +95,12 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
     off = last_word.broken_off
     return Summary(
         steps=plan.steps,
-        rounds_per_second=plan.steps / seconds,
+        rounds_per_second=(plan.steps - before) / seconds,
         messages=last_word.messages,
         missing=last_word.missing,
         recorded_steps=plan.steps if off is None else off.steps,
         broken_off="" if off is None else str(off),
+        pacing=None if timekeeper is None else timekeeper.pacing(),
     )
 
 
@@ -91,22 +115,56 @@ class Conductor:
         self._broken_off: BrokenOff | None = None
         self._lacking: list[str] = []
         self._started = False
+        self._identity = os.urandom(8).hex()
+        self._recorded = 0  # steps whose modes the recorder has, in a paced run that is taken up again
+        if plan.needs_no_plant(gains.problem):
+            self._everybody.remove(PLANT)
 
     def start(self) -> None:
-        """The barrier, and the order to start."""
+        """The barrier, and the order to start; a paced run that has lost its coordinator is taken up where it is."""
         self._bus.enter()
+        try:
+            self._gather()
+        except Orphaned as run:
+            self._take_up(run.ready)
+            return
+        self._order("start")
+        self._started = True
+        self._announce("start", f"{self._plan.steps} steps, seed {self._plan.seed}")
+        for fault in self._plan.faults:
+            self._announce("fault", fault)
+
+    def _take_up(self, first: Ready) -> None:
+        """Go on with the chain at the step after the last mode that anybody has had."""
+        answers = self._bus.gather_underway(first, seconds=TAKE_UP_SECONDS)
+        self._refuse_other_gains(answers)
+        self._identity = first.identity
+        self.complete = max(answer.step for answer in answers.values())
+        self._order("start")
+        greeting = self._bus.greeted(seconds=self._bus.network.wait, heed=self._welcome)
+        self._recorded = min(self.complete, greeting.steps)
+        self._started = True
+        self._announce("resumed", f"the coordinator goes on at step {self.complete}", about=COORDINATOR)
+
+    def _welcome(self, word: Incoming | None) -> None:
+        """Whoever has come is told that the run is under way."""
+        match word:
+            case Peer(who=who, present=True) if self._takes_part(who):
+                self._order("start")
+
+    def _gather(self) -> None:
         for who in self._bus.meet([*self._everybody, *map(sensor_who, self._plan.external)]):
             self._report({"joined": who})
+        self._refuse_other_gains(self._bus.gather(self._everybody))
+
+    def _refuse_other_gains(self, answers: Mapping[str, Ready]) -> None:
         own = self._gains.digest()
-        for who, ready in self._bus.gather(self._everybody).items():
+        for who, ready in answers.items():
             if ready.gains != own:
                 raise InputError(
                     f"{in_words(who)} runs on other gains ({ready.gains[:12]}...) than the coordinator "
                     f"({own[:12]}...); give everybody the same gains file"
                 )
-        self._order("start")
-        self._started = True
-        self._announce("start", f"{self._plan.steps} steps, seed {self._plan.seed}")
 
     def give_out_modes(self) -> None:
         """One mode for every step, at most a window ahead of what is recorded."""
@@ -120,8 +178,31 @@ class Conductor:
         while self.complete < self._plan.steps:
             self._wait_for_progress()
 
+    def keep_time(self, timekeeper: Timekeeper) -> None:
+        """One mode a period, whoever is there."""
+
+        def tick(step: int) -> None:
+            self.complete = step + 1
+            self._report_progress()
+
+        timekeeper.keep_time(tick, first=self.complete, recorded=self._recorded)
+
+    def heed(self, word: Incoming) -> None:
+        """What is heard in a paced run: who comes and goes, and what becomes of the recording."""
+        match word:
+            case Acknowledged() as acknowledged:
+                self._heed(acknowledged.broken_off)
+            case Peer(who=who, present=present) if self._takes_part(who):
+                self._announce("back" if present else GONE, in_words(who), about=who)
+                self._welcome(word)
+
+    def stood(self, seconds: float) -> None:
+        """The clock of a paced run stood still."""
+        self._announce("stood", f"the clock of the run stood still for {seconds:.3g} s before step {self.complete}")
+
     def close(self) -> Acknowledged:
         """All is done: the recorder closes the recording, then everybody leaves."""
+        self._report({"ending": ""})
         self._announce("end", "all steps are done")
         self._order("close")
         last_word = self._bus.wait_for_close()
@@ -131,6 +212,7 @@ class Conductor:
 
     def stop(self, reason: str) -> Acknowledged | None:
         """Tell everybody why the run ends here, and wait for the recorder where there is something to close."""
+        self._report({"ending": reason})
         if self._started:
             self._announce("stop", reason)
         self._order("stop", reason)
@@ -149,11 +231,17 @@ class Conductor:
                 window=plan.window,
                 external=list(plan.external),
                 reason=reason,
+                step=self.complete if plan.pace is not None else 0,
+                gains=self._gains.digest(),
+                identity=self._identity,
+                faults=list(plan.faults),
+                **({} if plan.pace is None else plan.pace._asdict()),
             )
         )
 
-    def _announce(self, kind: str, detail: str, *, who: str = COORDINATOR) -> None:
-        self._bus.publish(EVENT, Event(step=max(0, self.complete - 1), kind=kind, who=who, detail=detail))
+    def _announce(self, kind: str, detail: str, *, who: str = COORDINATOR, about: str = "") -> None:
+        step = max(0, self.complete - 1)
+        self._bus.publish(EVENT, Event(step=step, kind=kind, who=who, detail=detail, about=about))
 
     def _wait_for_progress(self) -> None:
         """Until the recorder holds one more step, the deadline passes, or somebody is lost.
@@ -173,6 +261,9 @@ class Conductor:
                     self._heed(acknowledged.broken_off)
                 case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who)
+        self._report_progress()
+
+    def _report_progress(self) -> None:
         if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._report({"complete": self.complete})

@@ -5,24 +5,47 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from agent.contract.errors import RecordingFailed, RunBroken
+from agent.contract.errors import InputError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import participants
+from agent.contract.keys import PLANT, RECORDER, in_words, participants
 from agent.contract.messages import Control
 from agent.network.bus import Bus
-from agent.network.words import ChannelClosed, RunClosed
+from agent.network.words import ChannelClosed, RunClosed, UnderWay
 
 
 def join(bus: Bus, gains: Gains) -> Control:
-    """Enter, meet everybody, say so, and wait for the start. Topics must be declared before."""
+    """Enter, meet everybody, say so, and wait for the start. Topics must be declared before.
+
+    A paced run that has begun without us is joined where it is. InputError where it is one of other gains.
+    """
     bus.enter()
     try:
-        for _ in bus.meet(participants(gains.problem)):
-            pass
-        bus.report_ready(gains.digest())
-        return bus.wait_for_start()
+        start = _met(bus, gains)
+        bus.has_begun = True
+        bus.patient, bus.identity = start.period > 0.0, start.identity
+        if start.step and bus.who != RECORDER:
+            bus.greeted()
+        return start
     except RunClosed as closed:
         raise RunBroken(closed.control.reason) from None
+
+
+def _met(bus: Bus, gains: Gains) -> Control:
+    """The order to start."""
+    try:
+        for _ in bus.meet(who for who in participants(gains.problem) if who != PLANT):
+            pass  # the plant meets us; whether there is one, the coordinator knows
+        bus.report_ready(gains.digest())
+        start = bus.wait_for_start()
+    except UnderWay as run:
+        start = run.start
+        bus.report_ready(gains.digest())
+    if start.step and start.gains != gains.digest():
+        raise InputError(
+            f"the run that {in_words(bus.who)} would join has other gains ({start.gains[:12]}...) than its own "
+            f"({gains.digest()[:12]}...); give everybody the same gains file"
+        )
+    return start
 
 
 def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
+import time
+from collections.abc import Callable, Mapping
 from itertools import count
 
 import numpy as np
-from pydantic import ValidationError
 
-from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
-from agent.contract.keys import MODE, decode, estimate, measurement
-from agent.contract.messages import Control, Estimate
+from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT, decode, estimate, measurement, node_who, sensor_who
+from agent.contract.messages import Account, Control, Estimate, Message, Mode
 from agent.contract.schedule import Deliveries
-from agent.filter import innovation, step
+from agent.estimates import told
+from agent.faults import Arriving, Ordeal, parse
+from agent.filter import Pair, innovation, step
 from agent.inbox import Inbox
+from agent.network.arrivals import Arrivals
 from agent.network.bus import Bus
+from agent.network.session import Channel
 from agent.network.words import Sample
+from agent.pacing.node import PacedNode
+from agent.plan import Pace
 from agent.roles.joining import take_part
+from agent.roles.suffering import suffer
 
 
 def run(bus: Bus, gains: Gains, *, node: str) -> None:
@@ -27,50 +35,110 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
     senders = {problem.node_names[j]: j for j in problem.ever_heard(i)}
     modes, measurements = bus.channel(MODE), bus.channel(measurement(node))
     estimates = {sender: bus.channel(estimate(sender)) for sender in senders if sender != node}
-    bus.advertise([estimate(node)])
+    bus.advertise([estimate(node), EVENT, ACCOUNT])
 
     def work(start: Control) -> None:
-        inbox, deliveries = Inbox(own), Deliveries(problem, seed=start.seed)
-        x_hat = np.zeros(problem.nx)
-        mode, heard = "", list[str]()  # what made x_hat
-        for k in count():
-            while inbox.y is None:
-                _put(inbox, measurements.next())
-            sent = _sent(own, k, x_hat, inbox.y, mode, heard)
-            bus.publish(estimate(node), sent)
-            inbox.put(node, sent)
-            while inbox.mode is None:
-                _put(inbox, modes.next())
-            while (sender := inbox.lacking) is not None:
-                _put(inbox, estimates[sender].next())
-            phi = deliveries.at(k)[i]  # a loss of the model: the message is there, and counts as if it were not
-            mode, pairs = inbox.mode, inbox.heard(lost={sender for sender, j in senders.items() if not phi[j]})
-            x_hat, heard = step(own, mode, pairs), list(pairs)
-            inbox.next_step()
-            for sender in estimates.keys() - set(heard):  # whose message was not needed must not pile up
-                for sample in estimates[sender].waiting():
-                    _put(inbox, sample)
+        deliveries = Deliveries(problem, seed=start.seed)
+
+        def lost(k: int) -> set[str]:
+            """Losses of the model: the message is there, and counts as if it were not."""
+            phi = deliveries.at(k)[i]
+            return {sender for sender, j in senders.items() if not phi[j]}
+
+        if not start.period:
+            _in_lock_step(bus, own, lost, modes, measurements, estimates)
+            return
+        sensor = sensor_who(node) if node in start.external else PLANT
+        paced = PacedNode(
+            own,
+            Pace(start.period, start.measure_by, start.hear_by),
+            steps=start.steps,
+            lost=lost,
+            is_there=lambda topic: (sensor if topic == measurement(node) else _node_of(topic)) in bus.present,
+            begins=start.step == 0,
+        )
+        faults = [parse(text, problem, steps=start.steps) for text in start.faults]
+        arriving = Arriving(faults, problem, node, seed=start.seed)
+        ordeal = Ordeal(faults, node_who(node), begin=start.step)
+        _against_the_clock(
+            bus, paced, Arrivals([modes, measurements, *estimates.values()]), node, arriving=arriving, ordeal=ordeal
+        )
 
     take_part(bus, gains, work)
 
 
-def _sent(own: NodeGains, k: int, x_hat: Array, y: Array, mode: str, heard: list[str]) -> Estimate:
-    try:
-        return Estimate(
-            step=k,
-            x_hat=x_hat.tolist(),
-            innovation=innovation(own, y, x_hat).tolist(),
-            z_hat=(own.M @ x_hat).tolist(),
-            mode=mode,
-            heard=heard,
-        )
-    except ValidationError:  # a message refuses NaN and infinity
-        raise RunBroken(f'the estimate of node "{own.node}" is not finite at step {k}; its gains let it grow') from None
+def _in_lock_step(
+    bus: Bus,
+    own: NodeGains,
+    lost: Callable[[int], set[str]],
+    modes: Channel,
+    measurements: Channel,
+    estimates: Mapping[str, Channel],
+) -> None:
+    """Step after step, each once everything is there, until a channel closes."""
+    inbox, x_hat = Inbox(own), np.zeros(own.M.shape[1])
+    mode, heard = "", list[str]()  # what made x_hat
+    for k in count():
+        while inbox.y is None:
+            _put(inbox, measurements.next())
+        sent = told(own, k, Pair(x_hat, innovation(own, inbox.y, x_hat)), mode=mode, heard=heard)
+        bus.publish(estimate(own.node), sent)
+        inbox.put(own.node, sent)
+        while inbox.mode is None:
+            _put(inbox, modes.next())
+        while (sender := inbox.lacking) is not None:
+            _put(inbox, estimates[sender].next())
+        mode, pairs = inbox.mode, inbox.heard(lost=lost(k))
+        x_hat, heard = step(own, mode, pairs), list(pairs)
+        inbox.next_step()
+        for sender in estimates.keys() - set(heard):  # whose message was not needed must not pile up
+            for sample in estimates[sender].waiting():
+                _put(inbox, sample)
+
+
+def _against_the_clock(
+    bus: Bus, paced: PacedNode, arrivals: Arrivals, node: str, *, arriving: Arriving, ordeal: Ordeal
+) -> None:
+    """Steps as they are due, until all are made or a channel closes."""
+    while not paced.done:
+        for sample, at in arrivals.until(paced.wake):
+            sender, message = _decoded(sample)
+            at += arriving.delay(sample.topic, message.step)
+            if at < math.inf:
+                paced.take(sender, message, at)
+            if isinstance(message, Mode):
+                suffer(ordeal.due(message.step))
+                bus.step = max(bus.step, message.step + 1)
+        try:
+            for message in paced.advance(time.monotonic()):
+                if isinstance(message, Account):
+                    message = message.model_copy(update={"processor": time.process_time()})
+                bus.publish(_topic_of(message, node), message)
+                paced.published(message, time.monotonic())
+        except ValueError as error:
+            raise RunBroken(f"a message to node {node} cannot be used: {error}") from None
+
+
+def _topic_of(message: Message, node: str) -> str:
+    match message:
+        case Estimate():
+            return estimate(node)
+        case Account():
+            return ACCOUNT
+    return EVENT
+
+
+def _node_of(topic: str) -> str:
+    return node_who(topic.split("/")[1])
+
+
+def _decoded(sample: Sample) -> tuple[str, Message]:
+    """The node that a message is from, "" for the mode, and the message."""
+    return sample.topic.split("/")[1] if sample.topic != MODE else "", decode(sample.topic, sample.payload)
 
 
 def _put(inbox: Inbox, sample: Sample) -> None:
-    sender = sample.topic.split("/")[1] if sample.topic != MODE else ""
     try:
-        inbox.put(sender, decode(sample.topic, sample.payload))
+        inbox.put(*_decoded(sample))
     except ValueError as error:
         raise RunBroken(f"a message on {sample.topic} cannot be used: {error}") from None

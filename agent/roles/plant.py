@@ -8,13 +8,15 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import MODE, PLANT_STATE, decode, measurement
+from agent.contract.keys import MODE, PLANT, PLANT_STATE, decode, measurement
 from agent.contract.messages import Control, Measurement, PlantState
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses
+from agent.faults import Ordeal, parse
 from agent.network.bus import Bus
 from agent.roles.joining import take_part
+from agent.roles.suffering import suffer
 
 
 def run(bus: Bus, gains: Gains) -> None:
@@ -26,8 +28,15 @@ def run(bus: Bus, gains: Gains) -> None:
 
     def work(start: Control) -> None:
         plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case)
+        faults = [parse(text, problem, steps=start.steps) for text in start.faults]
+        ordeal = Ordeal(faults, PLANT, begin=start.step)
         while True:
-            state, measurements = plant.advance(decode(MODE, modes.next().payload).step)
+            step = decode(MODE, modes.next().payload).step
+            if start.period:
+                suffer(ordeal.due(step))
+                plant.skip_to(step)
+                bus.step = step + 1
+            state, measurements = plant.advance(step)
             for name, y in measurements.items():
                 if name not in start.external:
                     bus.publish(measurement(name), y)
@@ -45,6 +54,11 @@ class SimulatedPlant:
         self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=worst_case)
         self._x = np.zeros(problem.nx)
         self._step = 0
+
+    def skip_to(self, step: int) -> None:
+        """Let the steps before `step` pass, of which no mode came: the plant goes on, seen or not."""
+        while self._step < step:
+            self.advance(self._step)
 
     def advance(self, step: int) -> tuple[PlantState, dict[str, Measurement]]:
         """The messages of step `step`; the steps must be asked for one after the other, or RunBroken is raised."""

@@ -11,10 +11,11 @@ from typing import NamedTuple, Self
 
 from agent.contract.errors import InputError, RecordingFailed
 from agent.contract.gains import Gains
-from agent.contract.keys import EVIDENCE
-from agent.contract.messages import Evidence
+from agent.contract.keys import EVIDENCE, decode, model_of, sender_of
+from agent.contract.messages import Account, Event, Evidence, Stamp, digest_of
 from agent.contract.recording import Logged
 from agent.contract.recording.evidence.chains import Chains
+from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import RecordingWriter, Split
 from agent.network.words import Sample
 from agent.receipts import Receipts
@@ -33,8 +34,19 @@ class Record:
     Where that fails, `failure` says why; from then on there are receipts for what comes, but nothing is written.
     """
 
-    def __init__(self, path: Path, *, run: dict[str, str], gains: Gains, force: bool, split: Split) -> None:
-        self.receipts = Receipts(gains.problem)
+    def __init__(
+        self,
+        path: Path,
+        *,
+        run: dict[str, str],
+        gains: Gains,
+        force: bool,
+        split: Split,
+        paced: bool = False,
+        cut: Cut | None = None,
+    ) -> None:
+        """`cut` is what a recorder before this one has left, of the same run."""
+        self.receipts = Receipts(gains.problem, paced=paced)
         self.failure = ""
         self.held = Held()
         self._path, self._chains = path, Chains()
@@ -42,16 +54,51 @@ class Record:
         self._blocks = 0  # of evidence
         self._writer: RecordingWriter | None = None
         with self._failing():
-            self._writer = RecordingWriter(path, run=run, gains=gains, force=force, split=split)
+            if cut is None:
+                self._writer = RecordingWriter(path, run=run, gains=gains, force=force, split=split)
+            else:
+                self._take_up(cut, run, gains, split)
 
-    def take(self, sample: Sample, step: int) -> bool:
-        """Take in a message; False where it was there already. Raises RunBroken for what cannot be recorded."""
+    def _take_up(self, cut: Cut, run: dict[str, str], gains: Gains, split: Split) -> None:
+        """Read what there is, end the part that was cut, and begin the next."""
+        for logged in cut.before():
+            self._again(logged)
+        cut.set_aside()
+        self._writer = RecordingWriter(self._path, run=run, gains=gains, split=split, first=cut.part)
+        for logged in cut.messages():
+            self._again(logged)
+        self._next_part()
+        cut.remove()
+
+    def _again(self, logged: Logged) -> None:
+        """Take in a message that an earlier recorder has recorded; what its sender says of it, it has said there."""
+        model = model_of(logged.topic)
+        if model in (None, Evidence):
+            return
+        message = decode(logged.topic, logged.payload)
+        sender = message.who if isinstance(message, Event | Account) else sender_of(logged.topic)
+        sender = sender if sender.startswith("node-") else sender_of(logged.topic)
+        digest = digest_of(logged.topic, logged.payload)
+        stamp = Stamp(logged.number, logged.publish_time, sender, digest)
+        self.take(Sample(logged.topic, logged.payload, stamp), message.step, at=logged.log_time)
+
+    def flush(self) -> None:
+        """Have the file hold all that came: who is told that it was received keeps it no longer."""
+        if self._writer is not None:
+            with self._failing():
+                self._writer.flush()
+
+    def take(self, sample: Sample, step: int, *, at: int | None = None) -> bool:
+        """Take in a message that came `at`, or now; False where it was there already.
+
+        Raises RunBroken for what cannot be recorded.
+        """
         stamp = sample.stamp
         if not self.receipts.take(sample.topic, step, stamp):
             return False
         if self._writer is None:
             return True
-        now = time.time_ns()
+        now = time.time_ns() if at is None else at
         number, published = (stamp.number, stamp.time) if stamp is not None else (0, now)
         try:
             self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
@@ -70,10 +117,14 @@ class Record:
             self._writer.flush_when_due()
             self._note_what_is_held()
             if self._writer.part_is_full:
-                for evidence in self._chains.rest():
-                    self._put(evidence)
-                self._writer.next_part(self._end())
-                self.held = self._before = self._all
+                self._next_part()
+
+    def _next_part(self) -> None:
+        assert self._writer is not None
+        for evidence in self._chains.rest():
+            self._put(evidence)
+        self._writer.next_part(self._end())
+        self.held = self._before = self._all
 
     def finish(self, *, status: str, reason: str) -> None:
         """End the recording."""

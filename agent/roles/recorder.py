@@ -16,19 +16,23 @@ from pathlib import Path
 
 from agent.contract.errors import Interrupted, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import EVENT, MODE, PLANT_STATE, decode, estimate, measurement, sender_of
-from agent.contract.messages import Acknowledged, BrokenOff, Control
+from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT_STATE, RECORDER, decode, estimate, measurement, sender_of
+from agent.contract.messages import Acknowledged, BrokenOff, Control, Ready
 from agent.contract.recording.parts import refuse_recording
+from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import Split
+from agent.faults import Ordeal, parse
 from agent.network.bus import Bus
 from agent.network.session import Channel
 from agent.network.words import RunClosed, Sample
 from agent.plan import RecordingPlan
 from agent.roles.joining import join
 from agent.roles.record import Record
+from agent.roles.suffering import suffer
 
 SHORTEST_PAUSE = 0.002  # s, while messages come; they wait in their channels meanwhile
 LONGEST_PAUSE = 0.02  # s, while none do
+ACKNOWLEDGE_SECONDS = 0.25  # between acknowledgements, in a paced run
 IDLE_SECONDS = 0.5  # silence after which it says what it lacks
 
 
@@ -39,14 +43,24 @@ def run(
 
     Where the recording breaks off `report` is told at once, and so is everybody else.
     """
-    refuse_recording(path, force=force)
+    cut = Cut.of(path)
+    if cut is None or cut.run.get("run") != bus.run:
+        refuse_recording(path, force=force)
     names = gains.problem.node_names
-    topics = [MODE, PLANT_STATE, EVENT, *map(measurement, names), *map(estimate, names)]
+    topics = [MODE, PLANT_STATE, EVENT, ACCOUNT, *map(measurement, names), *map(estimate, names)]
     channels = {topic: bus.channel(topic) for topic in topics}
     start = join(bus, gains)
     split = Split(plan.split_size, plan.split_seconds)
-    with Record(path, run=_facts(bus.run, gains, start), gains=gains, force=force, split=split) as record:
-        recorder = Recorder(bus, channels, record, window=start.window, goes_on=plan.goes_on, report=report)
+    if cut is not None and cut.run.get("identity") != start.identity:
+        refuse_recording(path, force=force)
+        cut = None
+    facts, paced = cut.run if cut is not None else _facts(bus.run, gains, start), start.period > 0.0
+    with Record(path, run=facts, gains=gains, force=force, split=split, paced=paced, cut=cut) as record:
+        faults = [parse(text, gains.problem, steps=start.steps) for text in start.faults]
+        ordeal = Ordeal(faults, RECORDER, begin=start.step) if paced else None
+        recorder = Recorder(
+            bus, channels, record, window=start.window, goes_on=plan.goes_on, report=report, ordeal=ordeal
+        )
         try:
             recorder.record()
         except RunClosed as closed:
@@ -73,7 +87,10 @@ class Recorder:
         window: int,
         goes_on: bool,
         report: Callable[[BrokenOff], None],
+        ordeal: Ordeal | None = None,
     ) -> None:
+        """`ordeal` is what a paced run has its recorder suffer; None in lock-step."""
+        self._ordeal, self._told = ordeal, 0.0
         self._bus, self._channels, self._record = bus, channels, record
         self._goes_on, self._report = goes_on, report
         self._publishers = sorted({sender_of(topic) for topic in channels})
@@ -86,12 +103,17 @@ class Recorder:
     def record(self) -> None:
         """Until Bus.receive raises: the run is closed, the coordinator lost, or a signal came."""
         pause = SHORTEST_PAUSE
+        if self._ordeal is not None:
+            self._ask_everybody()  # where there was a recorder before this one, for what came meanwhile
         while True:
             self._record.keep_up()
             self._heed_failure()
             word = self._bus.receive(timeout=pause)
-            if isinstance(word, Sample):  # a replay that we asked for
-                self._take(word)
+            match word:
+                case Sample():  # a replay that we asked for
+                    self._take(word)
+                case Ready(asks=True, who=who) if who in self._publishers:
+                    self._greet(who)
             pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
@@ -117,9 +139,18 @@ class Recorder:
             for sample in channel.waiting():
                 self._take(sample)
         new_steps, new_messages = receipts.complete - self._acknowledged, receipts.messages - before
-        if new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
+        if self._ordeal is not None:
+            self._acknowledge_at_times()
+        elif new_steps >= self._quantum or (new_steps > 0 and new_messages == 0):
             self._acknowledge()
         return new_messages > 0
+
+    def _acknowledge_at_times(self) -> None:
+        """In a paced run: now and then, what is in the file; so nothing is lost if this process is."""
+        if time.monotonic() - self._told >= ACKNOWLEDGE_SECONDS:
+            self._told = time.monotonic()
+            self._record.flush()
+            self._acknowledge()
 
     def _take(self, sample: Sample) -> None:
         try:
@@ -132,6 +163,8 @@ class Recorder:
             raise
         if self._record.take(sample, step):
             self._quiet_since = time.monotonic()
+        if self._ordeal is not None and sample.topic == MODE:
+            suffer(self._ordeal.due(step))
 
     def _heed_failure(self) -> None:
         """Tell everybody, once, that nothing can be recorded any more."""
@@ -141,9 +174,17 @@ class Recorder:
             self._report(self.broken_off)
             self._acknowledge()
 
+    def _greet(self, who: str) -> None:
+        """Tell somebody who has come back where their numbers go on; what a process before them kept is lost."""
+        self._take_waiting()
+        self._record.flush()
+        self._record.receipts.close_gap(who)
+        self._acknowledge(greets=who)
+
     def _complain(self) -> None:
         """Nothing has come for a while: ask everybody whether something was lost on the way, and say what lacks."""
         self._ask_everybody()
+        self._record.flush()
         self._acknowledge(lacking=self._record.receipts.lacking())
         self._quiet_since = time.monotonic()
 
@@ -152,9 +193,9 @@ class Recorder:
         for who in self._publishers:
             self._bus.request_replay(who, first=self._record.receipts.received.get(who, 0))
 
-    def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False) -> None:
+    def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False, greets: str = "") -> None:
         receipts = self._record.receipts
-        self._acknowledged = receipts.complete
+        self._acknowledged = self._bus.step = receipts.complete
         self._bus.acknowledge(
             Acknowledged(
                 steps=receipts.complete,
@@ -165,6 +206,7 @@ class Recorder:
                 lacking=lacking or [],
                 closed=closed,
                 broken_off=self.broken_off,
+                greets=greets,
             )
         )
 
@@ -181,7 +223,16 @@ def _facts(run: str, gains: Gains, start: Control) -> dict[str, str]:
         "steps": str(start.steps),
         "window": str(start.window),
         "external": ",".join(start.external),
+        **_pace(start),
         "started": datetime.now(UTC).isoformat(),
         "python": platform.python_version(),
         **{package: version(package) for package in packages},
     }
+
+
+def _pace(start: Control) -> dict[str, str]:
+    """What a recording tells of the clock of a paced run."""
+    if not start.period:
+        return {}
+    pace = {"period": start.period, "measure_by": start.measure_by, "hear_by": start.hear_by}
+    return {"identity": start.identity, **{name: repr(value) for name, value in pace.items()}}

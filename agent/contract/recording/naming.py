@@ -9,7 +9,7 @@ from agent.contract.recording import records
 from agent.contract.recording.records import Broken, Channel, Schema
 from agent.contract.recording.survey import Survey
 
-TOPIC = re.compile(r"(.*/)?(mode|plant/state|event|evidence|node/[^/]+/(?:measurement|estimate))", re.DOTALL)
+TOPIC = re.compile(r"(.*/)?(mode|plant/state|event|account|evidence|node/[^/]+/(?:measurement|estimate))", re.DOTALL)
 ENCODINGS = ("json", "")  # of their messages
 SCHEMAS = "peakmesh."  # what the names of our schemas begin with
 _CHUNKS = 8  # looked into for channels where none is described outside chunks

@@ -49,17 +49,27 @@ class RecordingWriter:
     """
 
     def __init__(
-        self, path: Path, *, run: dict[str, str], gains: Gains, force: bool = False, split: Split | None = None
+        self,
+        path: Path,
+        *,
+        run: dict[str, str],
+        gains: Gains,
+        force: bool = False,
+        split: Split | None = None,
+        first: int | None = None,
     ) -> None:
-        refuse_recording(path, force=force)
+        """`first` is the part to begin with where those before it are there already."""
+        if first is None:
+            refuse_recording(path, force=force)
         self._path, self._run, self._force, self._split = path, run, force, split or Split()
-        self._old = [there for there in files_of(path) if there not in (path, unfinished(path))]
+        old = [] if first is not None else files_of(path)
+        self._old = [there for there in old if there not in (path, unfinished(path))]
         self._attachments = {
             "problem.json": gains.problem.canonical(),
             "gains.json": gains.canonical(),
             "layout.json": json.dumps(foxglove_layout(gains.problem)).encode(),
         }
-        self._number = 1
+        self._number = first or 1
         self._part = self._begin()
 
     def _begin(self) -> _Part:
@@ -74,6 +84,10 @@ class RecordingWriter:
     def flush_when_due(self) -> None:
         """Flush and sync as often as promised."""
         self._part.flush_when_due()
+
+    def flush(self) -> None:
+        """Have the file hold everything that was added."""
+        self._part.flush_when_due(at_once=True)
 
     @property
     def is_flushed(self) -> bool:
@@ -178,9 +192,9 @@ class _Part:
         self._writer.flush()
         self.pending, self._end = 0, self._file.tell()
 
-    def flush_when_due(self) -> None:
+    def flush_when_due(self, *, at_once: bool = False) -> None:
         now = time.monotonic()
-        if now - self._flushed < FLUSH_SECONDS:
+        if now - self._flushed < FLUSH_SECONDS and not at_once:
             return
         try:
             self._flush()

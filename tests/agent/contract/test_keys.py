@@ -12,6 +12,7 @@ from places import ROOT
 from agent.contract import keys
 from agent.contract.gains import Gains
 from agent.contract.keys import (
+    ACCOUNT,
     ACKNOWLEDGED,
     CONTROL,
     COORDINATOR,
@@ -30,9 +31,11 @@ from agent.contract.keys import (
     node_who,
     participants,
     ready,
+    refused,
     replay,
     sender_of,
     sensor_who,
+    session,
     topic_of,
     watch,
 )
@@ -85,10 +88,12 @@ def test_the_table_names_every_key_of_the_code() -> None:
     """The docstring's tables have one row for each topic and each key, under the model the code gives it."""
     rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in re.findall(r"^\|.*\|$", keys.__doc__, re.M)]
     table = dict(row for row in rows if not row[0].startswith("-") and row[0] != "topic")
-    data = (MODE, PLANT_STATE, EVENT, EVIDENCE, measurement("<n>"), estimate("<n>"))
+    data = (MODE, PLANT_STATE, EVENT, ACCOUNT, EVIDENCE, measurement("<n>"), estimate("<n>"))
     topics = {topic: model_of(topic).__name__ for topic in data}
     others = {
         alive("<who>"): "liveliness",
+        session("<who>", "<id>"): "liveliness",
+        refused("<id>"): "a sentence",
         ready("<who>"): "Ready",
         CONTROL: "Control",
         ACKNOWLEDGED: "Acknowledged",

@@ -163,6 +163,19 @@ def test_signals_are_heeded_until_we_leave(ctrl_c: None, coordinator: Bus, recor
     assert last_word.closed
 
 
+def test_a_coordinator_that_may_come_back_is_not_waited_for_for_ever(coordinator: Bus) -> None:
+    """In a paced run its loss is no reason to go, until the wait is over."""
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=0.3), run="test", who=PLANT) as plant:
+        plant.enter()
+        list(coordinator.meet([PLANT]))
+        plant.report_ready("")
+        plant.patient = True
+        coordinator._session.close()
+        coordinator._session.close = lambda: None  # type: ignore[method-assign]  # the fixture would close it again
+        with pytest.raises(RunBroken, match=r"the coordinator was lost, and did not come back within 0\.3 s"):
+            drain(plant)
+
+
 @pytest.mark.parametrize("ignored", [False, True])
 def test_handlers_are_given_back(ctrl_c: None, ignored: bool) -> None:
     """Whoever had the signals before has them again afterwards; a SIGINT that is ignored stays so all the time."""

@@ -55,18 +55,22 @@ class Examiner:
     def __init__(self, *, external: Container[str] = ()) -> None:
         self._external = external
         self._senders: dict[str, Sender] = {}
-        self._of_topic: dict[str, Sender] = {}
+        self._of_topic: dict[tuple[str, str], Sender] = {}
         self._taken = self._unreadable = 0
 
-    def take(self, logged: Logged, step: int) -> None:
-        """Take in a message of step `step`, or evidence; -1 where a message does not say its step."""
+    def take(self, logged: Logged, step: int, who: str = "") -> None:
+        """Take in a message of step `step`, or evidence; -1 where a message does not say its step.
+
+        `who` sent it, where the topic does not tell.
+        """
         topic = logged.topic
         if topic == EVIDENCE:
             self._learn(logged.payload)
             return
-        sender = self._of_topic.get(topic)
+        sender = self._of_topic.get((topic, who))
         if sender is None:
-            sender = self._of_topic[topic] = self._sender(sender_of(topic, external=self._external))
+            sender = self._sender(who or sender_of(topic, external=self._external))
+            self._of_topic[topic, who] = sender
             sender.topics.add(topic)
         sender.take(Seen(logged.number, topic, step, digest_of(topic, logged.payload)))
         self._taken += 1

@@ -1,0 +1,38 @@
+"""What a node tells of a step, as the message that it sends. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pydantic import ValidationError
+
+from agent.contract.errors import RunBroken
+from agent.contract.gains import NodeGains
+from agent.contract.messages import Estimate
+from agent.filter import Pair
+
+
+def told(
+    own: NodeGains,
+    k: int,
+    pair: Pair,
+    *,
+    mode: str = "",
+    heard: Iterable[str] = (),
+    measured: bool = True,
+    origin: str = "",
+) -> Estimate:
+    """The estimate of step k. Raises RunBroken where it is not finite: a message refuses NaN and infinity."""
+    try:
+        return Estimate(
+            step=k,
+            x_hat=pair.x_hat.tolist(),
+            innovation=pair.innovation.tolist(),
+            z_hat=(own.M @ pair.x_hat).tolist(),
+            mode=mode,
+            heard=list(heard),
+            measured=measured,
+            origin=origin,
+        )
+    except ValidationError:
+        raise RunBroken(f'the estimate of node "{own.node}" is not finite at step {k}; its gains let it grow') from None

@@ -1,0 +1,53 @@
+"""Messages of several channels with the time at which each arrived, for whoever works against the clock."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from queue import Empty, SimpleQueue
+from typing import NamedTuple
+
+from agent.network.session import Channel
+from agent.network.words import ChannelClosed, Sample
+
+
+class Arrival(NamedTuple):
+    """A message, and when it arrived, on time.monotonic()."""
+
+    sample: Sample
+    at: float
+
+
+class Arrivals:
+    """What comes on these channels from now on, which nobody else may ask for any more; a thread for each waits there.
+
+    A thread's clock is read when the message is there, whatever the one who computes is doing.
+    """
+
+    def __init__(self, channels: Iterable[Channel]) -> None:
+        self._queue: SimpleQueue[Arrival | None] = SimpleQueue()  # None: a channel has closed
+        for channel in channels:
+            threading.Thread(target=self._watch, args=(channel,), daemon=True, name="arrivals").start()
+
+    def until(self, deadline: float) -> Iterator[Arrival]:
+        """What has arrived, once something has; nothing where the deadline passes first. Raises ChannelClosed."""
+        left = deadline - time.monotonic()
+        try:
+            arrival = self._queue.get(timeout=None if left == math.inf else max(0.0, left))
+            while True:
+                if arrival is None:
+                    raise ChannelClosed
+                yield arrival
+                arrival = self._queue.get_nowait()
+        except Empty:
+            return
+
+    def _watch(self, channel: Channel) -> None:
+        try:
+            while True:
+                sample = channel.next()
+                self._queue.put(Arrival(sample, time.monotonic()))
+        except ChannelClosed:
+            self._queue.put(None)

@@ -1,0 +1,88 @@
+"""Why messages were substituted, as far as their receiver can know; told in events, many to one. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from agent.contract.messages import GONE, LATE, SILENT, Event
+
+TELL_SECONDS = 0.5  # a reason waits for others to go with it for so long
+AT_MOST = 64  # reasons in one event
+
+
+class _Missed(NamedTuple):
+    step: int
+    topic: str
+
+
+class _Told(NamedTuple):
+    """Reasons that wait to go out together."""
+
+    since: float
+    steps: list[int]
+    seconds: list[float]
+
+
+class Reasons:
+    """What receiver `who` says of messages that were not there in time.
+
+    One that comes within `patience` seconds was late; of one that does not, the receiver knows no more than that its
+    sender was silent, or gone.
+    """
+
+    def __init__(self, who: str, *, patience: float) -> None:
+        self._who, self._patience = who, patience
+        self._open: dict[_Missed, float] = {}  # its deadline; in the order of the steps
+        self._told: dict[tuple[str, str], _Told] = {}
+
+    def missed(self, step: int, topic: str, *, deadline: float, gone: bool) -> None:
+        """A message was substituted; `gone`: nobody is there who could have sent it."""
+        if gone:
+            self._tell(GONE, topic, step, 0.0, deadline)
+        else:
+            self._open[_Missed(step, topic)] = deadline
+
+    def came(self, step: int, topic: str, at: float) -> bool:
+        """A message came after its step: whether it had been waited for."""
+        deadline = self._open.pop(_Missed(step, topic), None)
+        if deadline is None:
+            return False
+        self._tell(LATE, topic, step, at - deadline, at)
+        return True
+
+    @property
+    def due(self) -> float:
+        """When there will be something to say; infinity where there is not."""
+        silent = next(iter(self._open.values()), math.inf) + self._patience
+        return min([silent, *(told.since + TELL_SECONDS for told in self._told.values())])
+
+    def events(self, now: float, *, step: int, hurry: bool = False) -> Iterator[Event]:
+        """What is to be said by now, in step `step`; `hurry`: without waiting for more to say."""
+        while self._open and (deadline := next(iter(self._open.values()))) + self._patience <= now:
+            missed = next(iter(self._open))
+            del self._open[missed]
+            self._tell(SILENT, missed.topic, missed.step, 0.0, deadline)
+        for (kind, topic), told in list(self._told.items()):
+            if hurry or now >= told.since + TELL_SECONDS or len(told.steps) >= AT_MOST:
+                del self._told[kind, topic]
+                yield self._event(kind, topic, told, step)
+
+    def _tell(self, kind: str, topic: str, step: int, seconds: float, now: float) -> None:
+        told = self._told.setdefault((kind, topic), _Told(now, [], []))
+        told.steps.append(step)
+        told.seconds.append(seconds)
+
+    def _event(self, kind: str, topic: str, told: _Told, step: int) -> Event:
+        steps = f"step {told.steps[0]}" if len(told.steps) == 1 else f"{len(told.steps)} steps from {told.steps[0]}"
+        by = f" by up to {1e3 * max(told.seconds):.3g} ms" if kind == LATE else ""
+        return Event(
+            step=step,
+            kind=kind,
+            who=self._who,
+            detail=f"{topic} was {kind}{by} and was substituted: {steps}",
+            about=topic,
+            steps=told.steps,
+            seconds=told.seconds if kind == LATE else [],
+        )

@@ -1,0 +1,86 @@
+"""The coordinator's clock, with a bus that says what the test wants."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from agent.contract.errors import RunBroken
+from agent.contract.gains import Gains
+from agent.contract.messages import Account, Mode
+from agent.network.words import Sample
+from agent.plan import Pace, Plan
+from agent.roles.timekeeper import Timekeeper
+
+PACE = Pace(0.001)
+
+
+class Wire:
+    """Bus and channel in one: hears the accounts it was given, and takes what is published."""
+
+    def __init__(self, accounts: list[Account]) -> None:
+        self.sent: list[Mode] = []
+        self.present = {"recorder"}
+        self._accounts = accounts
+
+    def channel(self, topic: str) -> Wire:
+        assert topic == "account"
+        return self
+
+    def waiting(self) -> Iterator[Sample]:
+        while self._accounts:
+            yield Sample("account", self._accounts.pop().encode(), None)
+
+    def publish(self, topic: str, message: Mode) -> None:
+        assert topic == "mode"
+        self.sent.append(message)
+
+    def receive(self, *, timeout: float) -> None:
+        return None
+
+
+def account(who: str, *, substituted: int, step: int = 30) -> Account:
+    names = [f"to_{what}_{which}" for what in ("estimate", "step") for which in ("median", "p99", "max")]
+    counts = {"steps": 31, "pairs": 100, "pairs_substituted": substituted, "measurements_substituted": 0, "late": 0}
+    times: dict[str, Any] = dict.fromkeys(names, 0.01)
+    return Account(who=who, step=step, processor=0.31, **counts, **times)
+
+
+def kept(gains: Gains, accounts: list[Account], *, first: int = 0, recorded: int = 0, steps: int = 5) -> Wire:
+    wire = Wire(accounts)
+    plan = Plan(steps, seed=1, pace=PACE)
+    keeper = Timekeeper(wire, gains, plan, heed=lambda word: None, stood=lambda seconds: None)  # type: ignore[arg-type]
+    keeper.keep_time(lambda step: None, first=first, recorded=recorded)
+    return wire
+
+
+def everybody(gains: Gains, **facts: int) -> list[Account]:
+    return [account(f"node-{name}", **facts) for name in gains.problem.node_names]
+
+
+def test_who_goes_on_gives_out_the_same_chain(gains: Gains) -> None:
+    """From any step on, and once more what the recorder has not got."""
+    whole = kept(gains, [], steps=40).sent
+    assert [mode.step for mode in whole] == list(range(40))
+    assert kept(gains, [], first=23, recorded=20, steps=40).sent == whole[20:]
+
+
+def test_a_period_that_is_too_short_is_refused_with_one_that_is_not(gains: Gains) -> None:
+    with pytest.raises(RunBroken) as caught:
+        kept(gains, everybody(gains, substituted=80))
+    assert str(caught.value).startswith("a period of 1 ms is shorter than this machine can hold: in 1 steps 80% of ")
+    able = int(str(caught.value).rpartition("--period ")[2].removesuffix("ms"))
+    assert able >= 2
+
+
+@pytest.mark.parametrize("substituted", [0, 50])
+def test_a_period_that_is_long_enough_is_not(gains: Gains, substituted: int) -> None:
+    assert len(kept(gains, everybody(gains, substituted=substituted)).sent) == 5
+
+
+def test_one_node_that_is_late_does_not_make_a_period_too_short(gains: Gains) -> None:
+    accounts = everybody(gains, substituted=0)
+    accounts[0] = accounts[0].model_copy(update={"pairs_substituted": 100})
+    assert len(kept(gains, accounts).sent) == 5
