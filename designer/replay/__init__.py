@@ -20,15 +20,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path as FilePath
+from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.problem import Problem
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
+from designer.replay.coupling import Coupling, with_the_plant
 from designer.replay.gamma import checked_gamma
 from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
+from designer.replay.pacing import Pacing
 from designer.replay.part import Part
 from designer.replay.proofs import Check
 from designer.replay.trace import Trace
@@ -40,7 +43,7 @@ _STEPS_AT_ONCE = 1024
 _NUMBERS_AT_ONCE = 2_000_000  # of output covariances held at once, 16 MB
 
 
-def tolerance(problem: Problem) -> float:
+def tolerance(problem: Problem, *, paced: bool = False) -> float:
     """The one tolerance: 5 (n_eta + sum ny + nw + n + 4) u, relative, with u = 2^-53; links and bias below.
 
     Every sum in float64 is the exact sum of terms that are each off by a factor (1 + d)^m, |d| <= u, where m
@@ -62,13 +65,16 @@ def tolerance(problem: Problem) -> float:
     most, the rounding of that sum with it. That number is added. The node's own sums have one term and one difference
     more, for which the bound above has room.
 
+    Paced runs: any link may lose a message, so the sums are as long as with lossy links, and up to n terms join K_ii;
+    what acted is no mean, so nothing cancels but theta - beta, and the magnitude stays twice. 9 is above that, too.
+
     No gain enters: what large gains amplify is in the magnitude, and so is a state that grows. One unit in the last
     place of an estimate is a gap of at most 2 u and lies within; a change of 1e-6 of it lies eight orders of magnitude
     above u.
     """
     ny = sum(node.C.shape[0] for node in problem.nodes)
     n_eta = problem.nx * (problem.n + 1)
-    factor = 9 if (problem.delivery < 1.0).any() else 5
+    factor = 9 if paced or (problem.delivery < 1.0).any() else 5
     rounded = 5 * (problem.n + 2) if problem.unbiased else 0
     return float((factor * (n_eta + ny + problem.nw + problem.n + 4) + rounded) * UNIT)
 
@@ -94,10 +100,10 @@ def replay(
 def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, report: Report | None = None) -> Verdict:
     """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
     central = Central.of(log.gains)
-    tally = Tally(tolerance(log.gains.problem), log.gains.problem.node_names, trace, part)
+    tally = Tally(tolerance(log.gains.problem, paced=log.is_paced), log.gains.problem.node_names, trace, part)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
-        audit = _compare(log, central, tally, report or (lambda what, done, of: None))
-    return _verdict(log, tally, audit)
+        compared = _compare(log, central, tally, report or (lambda what, done, of: None))
+    return _verdict(log, tally, compared)
 
 
 class Tally:
@@ -181,26 +187,46 @@ class PathAudit:
         return smallest if self.step >= 0 else "nothing disturbed the run"
 
 
-def _compare(log: Log, central: Central, tally: Tally, report: Report) -> tuple[PathAudit, float] | None:
-    """All checks, a block of steps at a time; returns proof 5 and the energy of w where errors can be computed."""
+class _Compared(NamedTuple):
+    """What the checks found beside gaps."""
+
+    audit: PathAudit | None  # proof 5, where errors can be computed
+    energy: float | None  # and sum of |w|^2
+    pacing: Pacing | None
+
+
+def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compared:
+    """All checks, a block of steps at a time."""
     drawn = draw(log, central)
     inputs = logged_inputs(log, central, drawn)
     hears = proofs.to_be_heard(log, central, drawn)
+    coupling = pacing = None
+    if log.is_paced:
+        log = with_the_plant(log, drawn)
+        coupling = Coupling.of(log, central, inputs, drawn, hears)
+        pacing = Pacing.of(coupling, hears, log.period)
+        central, hears = coupling.central, coupling.hears
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
         now = slice(first, min(first + _STEPS_AT_ONCE, log.steps))
         tally.add(proofs.input_checks(log, central, drawn, now))
-        tally.add(proofs.step_checks(log, central, inputs, now))
+        if coupling is None:
+            tally.add(proofs.step_checks(log, central, inputs, now))
+        else:
+            tally.add(coupling.told_checks(now))
+            tally.add(coupling.step_checks(now))
         tally.add(proofs.message_checks(log, central, hears, now))
         report("comparing, first pass", now.stop, log.steps)
-    whole = free_run.complete(inputs, drawn, log, central)
+    whole = coupling.inputs if coupling is not None else free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
     if tally.trace is not None and log.has_plant:
         tally.trace.energy_before[:] = energy_before
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
-    audit, errors = PathAudit(log.gains.problem.nw, tally.part), log.error_norms()
-    for part in free_run.free_run(log, central, whole, block=block):
+    audit = PathAudit(log.gains.problem.nw, tally.part)
+    errors = log.error_norms() if coupling is None else coupling.error_norms()
+    parts = free_run.free_run(log, central, whole, block=block) if coupling is None else coupling.free_run(block=block)
+    for part in parts:
         tally.add([free_run.free_check(log, central, part)])
         report("comparing, second pass", part.first + len(part.eta), log.steps)
         if log.has_plant:
@@ -208,7 +234,9 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> tuple[
             audit.add(path, tally.tolerance)
             if tally.trace is not None:
                 tally.trace.path_bound[path.first : path.first + len(path.bound)] = path.bound
-    return (audit, float(energies.sum())) if log.has_plant else None
+    if not log.has_plant:
+        return _Compared(None, None, pacing)
+    return _Compared(audit, float(energies.sum()), pacing)
 
 
 def _peak(log: Log) -> Peak | None:
@@ -219,8 +247,8 @@ def _peak(log: Log) -> Peak | None:
     return Peak(float(errors[step]), step)
 
 
-def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> Verdict:
-    end = log.end or {}
+def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
+    end, audit = log.end or {}, compared.audit
     return Verdict(
         recording=log.label,
         part=tally.part,
@@ -238,7 +266,7 @@ def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> V
         whole=log.is_whole,
         is_simulated=log.is_simulated,
         external=tuple(name for name, real in zip(log.gains.problem.node_names, log.external, strict=True) if real),
-        proofs=tuple(_proofs(log, tally, audit[0] if audit else None)),
+        proofs=tuple(_proofs(log, tally, audit)),
         worst_gap=max(tally.gaps.values()),
         worst=tally.worst,
         tolerance=tally.tolerance,
@@ -253,9 +281,10 @@ def _verdict(log: Log, tally: Tally, audit: tuple[PathAudit, float] | None) -> V
         numbering=log.census.numbering,
         evidence=log.evidence,
         peak=_peak(log),
-        energy=audit[1] if audit else None,
+        energy=compared.energy,
         gamma=checked_gamma(log.gains),
-        path_margin=audit[0].margin if audit and audit[0].step >= 0 else None,
+        pacing=compared.pacing,
+        path_margin=audit.margin if audit and audit.step >= 0 else None,
     )
 
 

@@ -19,8 +19,7 @@ Of a file that is cut, damaged or of a run that did not finish, everything is la
 than it shows anything. Either is named.
 
 Numbers that a tool has rewritten say nothing, and are told apart from numbers with a fault by how many there are. In a
-part too few may be left to tell, so faults of theirs are noted there, and held against nobody; and so is a number that
-cannot be right where no checksum covers it.
+part too few may be left to tell, so faults of theirs are noted there, and held against nobody.
 """
 
 from __future__ import annotations
@@ -79,13 +78,13 @@ class Facts:
 
     steps: int  # that are to be there
     is_finished: bool  # the run came to its end, and the file is sound
-    is_checked: bool  # a checksum covers every message
     has_start: bool  # the coordinator's first event is there
     has_end: bool  # and its last
     events: Numbers  # their numbers
     event_copies: int
     recorded: dict[str, int]  # messages of each sender by the word of the recorder; empty where it is not known
     unplanned: frozenset[str]  # topics that the run need not have
+    excused: Flags | None = None  # (steps, topics): what nobody was there to send, in a paced run
 
 
 class Holes(NamedTuple):
@@ -114,7 +113,7 @@ def take_census(
     """Compare what is there with one message of every topic for each step; of the holes only those in `part` count."""
     topics = [topic for topic in topics if topic.topic not in facts.unplanned]
     strange = [*strange, *_beyond(topics, facts.steps)]
-    holes = _holes(topics, columns, facts.steps)
+    holes = _holes(topics, columns, facts.steps, facts.excused)
     lacking_of = Counter({topic.topic: int(holes.length[holes.topic == at].sum()) for at, topic in enumerate(topics)})
     numbering = read_numbering(
         topics, columns, lacking_of, steps=facts.steps, events=facts.events, recorded=facts.recorded
@@ -123,9 +122,8 @@ def take_census(
     is_part |= numbering.is_part
     lacks = np.ones_like(lacks) if is_part else lacks & ~_contradicted(holes, topics, facts)
     is_part |= bool(lacks.any())
-    unseen = () if is_part else numbering.unseen
+    unseen = numbering.unseen if facts.is_finished else ()
     lacking, missing = _within(holes.where(lacks), topics, part), _within(holes.where(~lacks), topics, part)
-    counts = not is_part and (facts.is_checked or numbering.is_exchanged)
     events = numbering.events if is_part or not facts.is_finished else 0
     copies = sum(topic.copies for topic in topics) + facts.event_copies
     words = "stands in it again with the same content, and counts" if copies == 1 else "stand in it again, and count"
@@ -139,8 +137,8 @@ def take_census(
         duplicates=Faults(len(double), tuple(sorted(double, key=_by_step)[:NAMED])),
         copies=copies,
         strange=tuple(strange),
-        numbering=(*(numbering.faults if counts else ()), *unseen),
-        notes=(*numbering.notes, *(() if counts else numbering.faults), *again),
+        numbering=() if is_part else (*numbering.faults, *unseen),
+        notes=(*numbering.notes, *(numbering.faults if is_part else ()), *again),
     )
 
 
@@ -154,13 +152,13 @@ def _beyond(topics: list[Topic], steps: int) -> Iterator[str]:
             yield f"{topic.topic}, step {topic.last}: the run ended after {steps} steps"
 
 
-def _holes(topics: list[Topic], columns: Columns, steps: int) -> Holes:
-    """Every stretch of the steps 0 ... `steps` - 1 that is not there."""
+def _holes(topics: list[Topic], columns: Columns, steps: int, excused: Flags | None) -> Holes:
+    """Every stretch of the steps 0 ... `steps` - 1 that is not there, and not `excused`."""
     found = []
     for at, topic in enumerate(topics):
         there = np.zeros(steps, dtype=bool)
         has = columns["has"][:steps, topic.place]
-        there[: len(has)] = has
+        there[: len(has)] = has if excused is None else has | excused[:, topic.place]
         edges = np.diff(np.concatenate([[True], there, [True]]).astype(np.int8))
         first, end = np.flatnonzero(edges == -1), np.flatnonzero(edges == 1)
         time = columns["time"][:, topic.place]

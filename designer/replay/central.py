@@ -98,7 +98,7 @@ class Central:
     def y_owner(self) -> Numbers:
         return np.repeat(np.arange(self.problem.n), [node.C.shape[0] for node in self.problem.nodes])
 
-    def magnitude(self, s: int, x: Array, x_hat: Array, w: Array, y: Array) -> Array:
+    def magnitude(self, s: int, x: Array, x_hat: Array, w: Array, y: Array, *, stand_in: Array | None = None) -> Array:
         """What adds up to eta(k+1) in mode s at most, in absolute values, (steps, n_eta).
 
         For x: |A||x| + |B||w|. For e_i, that and, over the neighbours j, a_ij |K_ij| (|x| + |x_hat_j|)
@@ -112,7 +112,9 @@ class Central:
         reach = np.tile(x, n) + x_hat
         of_y = y + reach @ np.abs(self.bar.C).T + w @ np.abs(self.bar.D).T
         of_e = np.tile(of_x, n) + reach @ np.abs(self.K_bar[s]).T + of_y @ np.abs(self.H_bar[s]).T
-        if self.stand_in is not None:
+        if stand_in is None and self.stand_in is not None:
+            stand_in = self.stand_in[s]
+        if stand_in is not None:
             own = reach.reshape(-1, n, self.problem.nx)
-            of_e += np.einsum("kic,irc->kir", own, self.stand_in[s]).reshape(of_e.shape)
+            of_e += np.einsum("kic,irc->kir", own, stand_in).reshape(of_e.shape)
         return np.asarray(np.maximum(np.hstack([of_x, of_e]) if self.model.plant_states else of_e, FLOOR))

@@ -83,7 +83,7 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
             covariances = A_k @ covariances @ A_k.T
             covariances[0] += B_k @ B_k.T
             covariances[1, diagonal, diagonal] += squares[row]
-        yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), _largest(outputs))
+        yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), largest(outputs))
 
 
 def _delivered_gains(central: Central, s: int, delivered: Flags | None) -> Array:
@@ -139,7 +139,7 @@ def _magnitudes(log: Log, central: Central, inputs: Inputs, x: Array, eta: Array
     return magnitude
 
 
-def _largest(matrices: Array) -> Array:
+def largest(matrices: Array) -> Array:
     """Square root of the largest eigenvalue of each symmetric matrix, nan where it is not finite."""
     finite = np.isfinite(matrices).all(axis=(1, 2))
     largest = np.full(len(matrices), np.nan)

@@ -5,6 +5,7 @@ Messages are matched by (topic, step), never by their place in the file.
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -18,15 +19,17 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, EVIDENCE, PLANT, PLANT_STATE, measurement
-from agent.contract.messages import Event
+from agent.contract.keys import ACCOUNT, COORDINATOR, EVENT, EVIDENCE, PLANT, PLANT_STATE, measurement
+from agent.contract.messages import Account, Event
 from agent.contract.recording import Logged
 from agent.contract.recording.evidence.examiner import Examiner, Findings
 from agent.contract.recording.reader import Progress, RecordingReader
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.part import Part
+from designer.replay.said import Said, excused
 from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
+_MEMORY = 2.0  # seconds, and two steps, after which a node has said why it substituted something
 _NAMED = 3  # so many damages and topics are named
 _LARGEST = 1 << 33  # bytes of the arrays that hardly any message fills
 
@@ -65,6 +68,14 @@ class Log:
     z_hat: Array  # (steps, n nz)
     used: Numbers  # (steps, n): Estimate.mode
     heard: Numbers  # (steps, n): Estimate.heard
+    told: Numbers  # (steps, n): Estimate.measured
+    origin: Numbers  # (steps, n): Estimate.origin, by `Senders.origin`; -1 where a node goes on
+    said: Said  # what its events say of messages that were not there in time
+    period: float  # seconds, of a paced run; 0 in lock-step
+
+    @property
+    def is_paced(self) -> bool:
+        return self.period > 0.0
 
     @property
     def is_simulated(self) -> bool:
@@ -104,10 +115,10 @@ def load(
     paths = [path] if isinstance(path, Path) else list(path)
     with RecordingReader(*paths, run=run, gains=gains) as reader:
         seed, planned = _integer(reader.run, "seed", path=paths[0]), _integer(reader.run, "steps", path=paths[0])
-        external = _external(reader)
+        external, period = _external(reader), _period(reader)
         if part is not None and part.node is not None:
             reader.gains.problem.node_index(part.node)  # refuses a name that does not exist
-        content = _Content(reader.gains, external, planned)
+        content = _Content(reader.gains, external, planned, period)
         content.read(reader.messages(report))
         return _log(reader, content, external, part or Part(), seed=seed, planned=planned)
 
@@ -136,7 +147,7 @@ def _log(
     census = take_census(
         topics.values(),
         columns,
-        content.facts(end, steps=expected, finished=finished, checked=not reader.is_unchecked, external=external),
+        content.facts(end, steps=expected, finished=finished, external=external),
         strange=strange,
         part=part,
     )
@@ -162,6 +173,8 @@ def _log(
         external=external,
         modes=content.modes,
         senders=content.senders,
+        said=content.said,
+        period=content.period,
         **_arrays(columns, topics, problem.node_names, steps),
     )
 
@@ -184,8 +197,14 @@ def _arrays(columns: Columns, topics: dict[str, Topic], names: tuple[str, ...], 
                 columns[name][:steps][absent, column] = -1
     fields = {name: columns[name][:steps] for name in ("x", "z", "w", "y", "innovation", "x_hat", "z_hat")}
     words = {name: columns[name][:steps] for name in ("used", "heard")}
+    goes_on = np.broadcast_to(-1, words["used"].shape)
+    told, origin = -goes_on, goes_on
+    if any("told" in topic.words for topic in topics.values()):
+        told, origin = columns["told"][:steps], columns["origin"][:steps]
     return {
         **fields,
+        "told": told,
+        "origin": origin,
         **words,
         "mode": columns["mode"][:steps, 0],
         "theta": columns["arrived"][:steps],
@@ -196,9 +215,12 @@ def _arrays(columns: Columns, topics: dict[str, Topic], names: tuple[str, ...], 
 class _Content:
     """What is gathered while the messages stream by."""
 
-    def __init__(self, gains: Gains, external: tuple[bool, ...], planned: int) -> None:
+    def __init__(self, gains: Gains, external: tuple[bool, ...], planned: int, period: float) -> None:
         self.modes, self.senders = Words(gains.problem.mode_names), Senders(gains.problem.node_names)
-        self.topics, self.columns = topics_of(gains.problem, external, planned=planned)
+        self.period, self.is_paced, self._external = period, period > 0.0, external
+        self.topics, self.columns = topics_of(gains.problem, external, planned=planned, paced=self.is_paced)
+        memory = 2 + math.ceil(_MEMORY / period) if period else 0
+        self.said = Said(gains.problem.node_names, memory=memory)
         self.messages = 0
         names = gains.problem.node_names
         self.examiner = Examiner(external=[name for name, real in zip(names, external, strict=True) if real])
@@ -218,7 +240,10 @@ class _Content:
                 self.examiner.take(logged, step)
             elif logged.topic == EVENT:
                 self.messages += 1
-                self.examiner.take(logged, self._event(logged))
+                self.examiner.take(logged, *self._event(logged))
+            elif logged.topic == ACCOUNT and self.is_paced:
+                self.messages += 1
+                self.examiner.take(logged, *self._account(logged))
             elif logged.topic == EVIDENCE:
                 self.examiner.take(logged, -1)
             else:
@@ -226,19 +251,35 @@ class _Content:
         for topic in topics.values():
             topic.settle(columns)
 
-    def _event(self, logged: Logged) -> int:
-        """The step of an event, -1 where it is none."""
+    def _event(self, logged: Logged) -> tuple[int, str]:
+        """The step of an event, -1 where it is none, and who sent it."""
         try:
             event = Event.decode(logged.payload)
         except ValidationError as error:
             words = error.errors(include_url=False)[0]["msg"].lower()
             self._unreadable.add(f"{EVENT}, number {logged.number}: {words}")
-            return -1
+            return -1, ""
         if event.who == COORDINATOR:
             self._kinds.add(event.kind)
+        self.said.add(event)
+        self._count(logged)
+        return event.step, event.who if self.said.is_node(event.who) else COORDINATOR
+
+    def _account(self, logged: Logged) -> tuple[int, str]:
+        try:
+            account = Account.decode(logged.payload)
+        except ValidationError as error:
+            words = error.errors(include_url=False)[0]["msg"].lower()
+            self._unreadable.add(f"{ACCOUNT}, number {logged.number}: {words}")
+            return -1, ""
+        self.said.account(account)
+        self._count(logged)
+        return account.step, account.who
+
+    def _count(self, logged: Logged) -> None:
+        """A message that has a number and no row of its own."""
         self._events.append(logged.number)
         self._keys.append(hash((logged.publish_time, logged.payload)))
-        return event.step
 
     def last(self) -> int:
         """The last step of which there is anything, -1 where there is nothing."""
@@ -256,9 +297,7 @@ class _Content:
             found.first += some.first
         return found
 
-    def facts(
-        self, end: dict[str, str], *, steps: int, finished: bool, checked: bool, external: tuple[bool, ...]
-    ) -> Facts:
+    def facts(self, end: dict[str, str], *, steps: int, finished: bool, external: tuple[bool, ...]) -> Facts:
         """What the census must know beside the messages."""
         _, first = np.unique(np.array(self._keys, dtype=np.int64), return_index=True)
         recorded = {
@@ -270,13 +309,13 @@ class _Content:
         return Facts(
             steps=steps,
             is_finished=finished,
-            is_checked=checked,
             has_start="start" in self._kinds,
             has_end="end" in self._kinds,
             events=np.array(self._events, dtype=np.int64)[first],
             event_copies=len(self._events) - len(first),
             recorded=recorded,
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
+            excused=excused(self.topics, self.columns, self.said, self._external, steps) if self.is_paced else None,
         )
 
 
@@ -312,6 +351,18 @@ def _joined(sentences: list[str]) -> str:
     """As one text; of many the first, and how many more."""
     more = len(sentences) - _NAMED
     return "; ".join([*sentences[:_NAMED], *([f"{more} more damages"] if more > 0 else [])])
+
+
+def _period(reader: RecordingReader) -> float:
+    """Of a paced run, in seconds; 0 in lock-step."""
+    text = reader.run.get("period", "0")
+    try:
+        period = float(text)
+    except ValueError:
+        period = -1.0
+    if not 0.0 <= period < 1e9:
+        raise InputError(f'{reader.path}: its metadata gives "{text}" for period; it must be a number of seconds')
+    return period
 
 
 def _external(reader: RecordingReader) -> tuple[bool, ...]:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.contract.keys import COORDINATOR
 from designer.replay.topics import Columns, Numbers, Topic
 
 Stored = NDArray[np.uint32]
@@ -22,7 +21,6 @@ class Numbering(NamedTuple):
 
     notes: tuple[str, ...] = ()  # that they are not the senders'
     faults: tuple[str, ...] = ()  # numbers that contradict each other
-    is_exchanged: bool = True  # every number is there once: messages were exchanged, no number is a wrong one
     unseen: tuple[str, ...] = ()  # numbers that nobody has, between those that are there
     events: int = 0  # messages that have no step of their own, and are not there
     is_part: bool = False  # these lack as they do where a part was taken
@@ -59,13 +57,8 @@ class _Sender:
             return int((self.numbers >= self.recorded).sum()) > most
         return last + 1 - len(self.numbers) - self._lacking - events > max(most, self.total // 2)
 
-    @property
-    def repeats(self) -> bool:
-        """A number stands on more than one message."""
-        return len(self._again) > 0
-
     def faults(self) -> list[str]:
-        again = [f"{self.who} has number {self._again[0]} on more than one message"] if self.repeats else []
+        again = [f"{self.who} has number {self._again[0]} on more than one message"] if len(self._again) else []
         return [*self._falls, *again]
 
     def unseen(self, events: Counter[int]) -> tuple[int, list[int], bool]:
@@ -101,7 +94,7 @@ def read_numbering(
     if total > 1 and not any(sender.numbers.any() for sender in senders):
         note = "the senders' numbering is not in the file: every number is 0"
     elif sum(sender.wrong for sender in senders) > total // SHARE or any(
-        sender.is_rewritten(len(events) if sender.who == COORDINATOR else 0) for sender in senders
+        sender.is_rewritten(len(events)) for sender in senders
     ):
         note = "the senders' numbering is not in the file: a tool has rewritten it"
     else:
@@ -139,10 +132,9 @@ def _senders(
 
 def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numbering:
     waiting = Counter(events.tolist())
-    unseen, total, is_part, is_exchanged = [], 0, False, True
+    unseen, total, is_part = [], 0, False
     for sender in senders:
         count, numbers, outermost = sender.unseen(waiting)
-        is_exchanged &= not sender.wrong or (not count and sender.wrong > 0 and not sender.repeats)
         count = count if absent is None else min(count, absent - total)
         total += count
         if count and (outermost or not len(events)):
@@ -152,7 +144,6 @@ def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numberi
             unseen.append(f"{count} more messages of {sender.who} are missing, by its numbers {first}")
     return Numbering(
         faults=tuple(fault for sender in senders for fault in sender.faults()),
-        is_exchanged=is_exchanged,
         unseen=tuple(unseen),
         events=total,
         is_part=is_part,

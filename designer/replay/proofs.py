@@ -111,7 +111,8 @@ def input_checks(log: Log, central: Central, drawn: Drawn, now: slice) -> Iterat
 def message_checks(log: Log, central: Central, hears: Numbers, now: slice) -> Iterator[Check]:
     """Proof 1, what each node says of itself: innovation, z_hat, and the mode and neighbours that it used.
 
-    The innovation of a node that sees its losses is 0 where its measurement is empty. `hears` (steps, n) are the
+    The innovation of a node that sees its losses is 0 where its measurement is empty, and in a paced run that of any
+    node where it was not there in time. `hears` (steps, n) are the
     positions in `log.senders` of those whose messages of each step every node was to use.
     """
     problem, M, nx, nz = central.problem, central.problem.plant.M, central.problem.nx, central.problem.nz
@@ -120,9 +121,10 @@ def message_checks(log: Log, central: Central, hears: Numbers, now: slice) -> It
         x_hat_i, y_i = x_hat[:, i * nx : (i + 1) * nx], y[:, columns]
         C_i = central.C_nu[columns, i * nx : (i + 1) * nx]
         expected, magnitude = y_i - x_hat_i @ C_i.T, np.abs(y_i) + np.abs(x_hat_i) @ np.abs(C_i).T
+        nothing = log.told[now, i] == 0
         if node.seen:
-            nothing = log.measured[now, i] == 0.0
-            expected[nothing], magnitude[nothing] = 0.0, 0.0
+            nothing |= log.measured[now, i] == 0.0
+        expected[nothing], magnitude[nothing] = 0.0, 0.0
         owner, logged = np.full(len(node.C), i), log.innovation[now][:, columns]
         yield numbers(1, "innovation", now.start, owner, logged, expected, magnitude)
         z_hat_i, owner = z_hat[:, i * nz : (i + 1) * nz], np.full(nz, i)
@@ -135,6 +137,8 @@ def message_checks(log: Log, central: Central, hears: Numbers, now: slice) -> It
     if now.start == 0:  # x_hat(0) was not made from anything
         expected_mode[0] = log.modes.number("")
         expected_heard[0] = log.senders.number(())
+    again = log.origin[now] != -1
+    expected_mode[again], expected_heard[again] = log.modes.number(""), log.senders.number(())
     yield names("mode", now.start, each, used, expected_mode, log.modes.texts)
     yield names("heard", now.start, each, heard, expected_heard, log.senders.texts)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from agent.contract.keys import COORDINATOR, MODE, PLANT, PLANT_STATE, estimate, measurement, node_who
-from agent.contract.messages import Estimate, Measurement, Message, Mode, PlantState
+from agent.contract.messages import ZERO_STATE, Estimate, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
 
@@ -61,6 +61,12 @@ class Senders:
                 self.texts.append(", ".join(in_order))
             self._known[key] = self._numbers[in_order]
         return self._known[key]
+
+    def origin(self, text: str) -> int:
+        """The node whose estimate another one begins again with; n for the zero state, -1 for none, -2 for no node."""
+        if text in ("", ZERO_STATE):
+            return len(self._node_names) if text else -1
+        return self._order.get(text, -2)
 
     def members(self) -> NDArray[np.bool_]:
         """(numbers, n): which nodes are in each set."""
@@ -178,6 +184,9 @@ class Topic:
         elif isinstance(message, Estimate):
             self._texts["used"].append(modes.number(message.mode))
             self._texts["heard"].append(senders.number(message.heard))
+            if "told" in self._texts:
+                self._texts["told"].append(message.measured)
+                self._texts["origin"].append(senders.origin(message.origin))
         if len(self._steps) == _AT_ONCE:
             self.settle(columns)
         return message.step
@@ -191,6 +200,8 @@ class Topic:
                 return f"{name} has {len(values)} numbers where the problem has {width}"
             if values and (max(values) > CEILING or min(values) < -CEILING):
                 return f"{name} holds {max(values, key=abs)}, beyond {CEILING:g}"
+        if isinstance(message, Estimate) and (message.origin or not message.measured) and "told" not in self.words:
+            return "it says what only paced runs have to say"
         return ""
 
     def settle(self, columns: Columns) -> None:
@@ -239,7 +250,9 @@ class Topic:
                 column[step] = values[at]
 
 
-def topics_of(problem: Problem, external: tuple[bool, ...], *, planned: int) -> tuple[dict[str, Topic], Columns]:
+def topics_of(
+    problem: Problem, external: tuple[bool, ...], *, planned: int, paced: bool = False
+) -> tuple[dict[str, Topic], Columns]:
     """Every topic that a run of this problem has, but events, and the columns that they fill.
 
     `external`: per node, is its sensor a real one. `planned`: steps of the run.
@@ -252,7 +265,7 @@ def topics_of(problem: Problem, external: tuple[bool, ...], *, planned: int) -> 
     for i, (node, is_real, end) in enumerate(zip(problem.nodes, external, ends.tolist(), strict=True)):
         y = slice(end - len(node.C), end)
         vectors = {"x_hat": slice(i * nx, (i + 1) * nx), "innovation": y, "z_hat": slice(i * nz, (i + 1) * nz)}
-        words, who = {"used": i, "heard": i}, node_who(node.name)
+        words, who = dict.fromkeys(("used", "heard", *(("told", "origin") if paced else ())), i), node_who(node.name)
         topics.append(Topic(estimate(node.name), Estimate, vectors, words, place=2 + 2 * i, who=who))
         sensor = None if is_real else PLANT
         topics.append(
@@ -268,6 +281,7 @@ def topics_of(problem: Problem, external: tuple[bool, ...], *, planned: int) -> 
         "mode": (1, np.int64),
         "used": (n, np.int64),
         "heard": (n, np.int64),
+        **(dict.fromkeys(("told", "origin"), (n, np.int64)) if paced else {}),
         "x": (nx, np.float64),
         "z": (nz, np.float64),
         "w": (problem.nw, np.float64),

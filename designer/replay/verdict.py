@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from agent.contract.arrays import ulps
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
@@ -12,6 +12,9 @@ from agent.contract.recording.evidence.examiner import Findings
 from designer.replay.census import Faults
 from designer.replay.gamma import Gamma
 from designer.replay.part import Part
+
+if TYPE_CHECKING:
+    from designer.replay.pacing import Pacing
 
 CLAIMS = {  # what each proof shows, and what is counted
     1: (
@@ -146,6 +149,7 @@ class Verdict:
     peak: Peak | None  # against the simulated plant, also where sensors measured something else
     energy: float | None  # sum of |w|^2
     gamma: Gamma
+    pacing: Pacing | None  # of a paced run
     path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound that is not trivial; bound: proof 5 and its rounding
 
     @property
@@ -211,6 +215,7 @@ class Verdict:
             "simulated": self.is_simulated,
             "real_sensors": bool(self.external),
             "external": list(self.external),
+            "pacing": self.pacing.document() if self.pacing else None,
             "peak": self.peak.size if self.peak else None,
             "peak_step": self.peak.step if self.peak else None,
             "energy": self.energy,
@@ -224,7 +229,8 @@ class Verdict:
     def text(self) -> str:
         if not self.compared:
             return "\n".join(self._head())
-        return "\n".join([*self._head(), *self._peak(), *self._proofs(), *self._faults()])
+        pacing = self.pacing.text() if self.pacing is not None else []
+        return "\n".join([*self._head(), *pacing, *self._peak(), *self._proofs(), *self._faults()])
 
     def headline(self) -> str:
         """The outcome, and in a few words why, where that is not a number."""

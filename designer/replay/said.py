@@ -1,0 +1,91 @@
+"""What the events of a paced run say of messages that were not there in time, and of who was away."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+
+from agent.contract.keys import PLANT, PLANT_STATE, estimate, measurement, node_who
+from agent.contract.messages import GONE, LATE, SILENT, Account, Event
+from designer.replay.central import Flags
+from designer.replay.topics import Columns, Numbers, Topic
+
+_NEAR = 2  # steps between somebody's last message and the event that says they are gone, beside the silence itself
+
+
+class Said:
+    """Gathered event by event. Nodes are counted from 0, in file order."""
+
+    def __init__(self, node_names: tuple[str, ...], *, memory: int = 0) -> None:
+        self.events = 0
+        self.accounts: dict[int, int] = {}  # of a node, the last step that it has given account of
+        self.memory = memory  # steps of which a process that is killed may not have given its reasons yet
+        self.pairs: set[tuple[int, int, int]] = set()  # (step, receiver, sender): it was substituted
+        self.measurements: set[tuple[int, int]] = set()  # (step, node)
+        self.began: set[tuple[int, int]] = set()  # (step, node): it began again
+        self.gone: dict[str, list[int]] = {}  # of a participant, about when it went
+        self.kinds: Counter[str] = Counter()  # why messages were substituted
+        self.faults: list[str] = []  # that were injected
+        self._nodes = {node_who(name): i for i, name in enumerate(node_names)}
+        self._estimates = {estimate(name): i for i, name in enumerate(node_names)}
+        self._measurements = {measurement(name): i for i, name in enumerate(node_names)}
+
+    def is_node(self, who: str) -> bool:
+        return who in self._nodes
+
+    def account(self, account: Account) -> None:
+        i = self._nodes.get(account.who)
+        if i is not None:
+            self.accounts[i] = max(account.step, self.accounts.get(i, -1))
+
+    def add(self, event: Event) -> None:
+        self.events += 1
+        i = self._nodes.get(event.who)
+        if event.kind == "fault":
+            self.faults.append(event.detail)
+        elif i is None and event.kind == GONE:
+            self.gone.setdefault(event.about, []).append(event.step)
+        elif i is not None and event.kind == "began":
+            self.began |= {(step, i) for step in event.steps}
+        elif i is not None and event.kind in (LATE, SILENT, GONE):
+            self.kinds[event.kind] += len(event.steps)
+            j = self._estimates.get(event.about)
+            if j is not None:
+                self.pairs |= {(step, i, j) for step in event.steps}
+            elif self._measurements.get(event.about) == i:
+                self.measurements |= {(step, i) for step in event.steps}
+
+
+def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external: tuple[bool, ...], steps: int) -> Flags:
+    """(steps, topics): which messages are not there because nobody was there to send them.
+
+    A node that begins again says so; for the plant, and for a node that never came back, the coordinator has said
+    that it was gone. A sensor's measurement may be missing wherever its node says that it had none.
+    """
+    has = columns["has"][:steps]
+    found = np.zeros_like(has)
+    for who, i in said._nodes.items():
+        place, told, origin = 2 + 2 * i, columns["told"][:steps, i], columns["origin"][:steps, i]
+        for first, end in _gaps(has[:, place]):
+            comes_back = end < len(has) and origin[end] != -1
+            found[first:end, place] = comes_back or _went(said.gone.get(who, []), first, end)
+        if external[i]:
+            found[:, place + 1] = ~has[:, place] | (told == 0)
+    simulated = [topic for topic in topics.values() if topic.who == PLANT or topic.topic == PLANT_STATE]
+    for topic in simulated:
+        for first, end in _gaps(has[:, topic.place]):
+            found[first:end, topic.place] = _went(said.gone.get(PLANT, []), first, end)
+    return found
+
+
+def _went(steps: list[int], first: int, end: int) -> bool:
+    return any(first - _NEAR <= step < end + _NEAR for step in steps)
+
+
+def _gaps(there: Flags) -> list[tuple[int, int]]:
+    """The first step of each stretch that is not there, and the step after its last."""
+    edges = np.diff(np.concatenate([[True], there, [True]]).astype(np.int8))
+    first: Numbers = np.flatnonzero(edges == -1)
+    return list(zip(first.tolist(), np.flatnonzero(edges == 1).tolist(), strict=True))

@@ -1,0 +1,349 @@
+"""Replay of paced runs: what really acted is reproduced exactly, whatever was late or away. With mutants."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_recordings import Sent, observer_gains, random_gains, random_problem, real_problem, record, simulate
+from paced_runs import PACE, SOON, PacedRun
+
+from agent.contract.gains import Gains
+from agent.contract.messages import ZERO_STATE
+from designer.replay import replay
+from designer.replay.verdict import Verdict
+
+STEPS = 60
+AWAY = range(30, 37)
+HIDDEN = random_gains(random_problem(3))
+REAL = observer_gains(real_problem(1, radius=1.02))
+SEEN = observer_gains(real_problem(2, links=False))
+
+
+class Weather:
+    """Delays that are drawn once: 5 % of all messages are lost, 15 % take up to two periods; ticks come through."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._drawn: dict[tuple[str, str, int], float] = {}
+
+    def __call__(self, receiver: str, topic: str, step: int) -> float:
+        if topic == "mode":
+            return SOON
+        place = receiver, topic, step
+        if place not in self._drawn:
+            draw = self._rng.random()
+            late = float(self._rng.uniform(0.0, 2.0 * PACE.period)) if draw < 0.2 else SOON
+            self._drawn[place] = math.inf if draw < 0.05 else late
+        return self._drawn[place]
+
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "late": {},
+    "node away": {"away": {"n1": AWAY}},
+    "node gone": {"away": {"n1": range(30, STEPS)}},
+    "plant away": {"away": {"plant": AWAY}},
+    "both away": {"away": {"plant": AWAY, "n2": range(34, 50)}},
+    "frozen": {"frozen": {"n0": AWAY}},
+}
+
+
+def faulty(gains: Gains, seed: int = 1, **faults: Any) -> list[Sent]:
+    return PacedRun(gains, steps=STEPS, seed=seed, delay=Weather(seed), **faults).messages
+
+
+TRUE = faulty(HIDDEN, **FAULTS["node away"])
+
+
+def verdict_of(folder: Path, sent: list[Sent], gains: Gains = HIDDEN, **facts: Any) -> Verdict:
+    return replay(record(folder / "run.mcap", gains, sent, steps=STEPS, **{"period": "0.1", **facts}))
+
+
+def document_of(topic: str, step: int, sent: list[Sent] = TRUE) -> dict[str, Any]:
+    return next(m.document for m in sent if m.topic == topic and m.document["step"] == step)
+
+
+def changed(topic: str, step: int, mutate: Callable[[dict[str, Any]], None]) -> list[Sent]:
+    """TRUE with one payload changed."""
+    at = next(i for i, m in enumerate(TRUE) if m.topic == topic and m.document["step"] == step)
+    return with_document(at, mutate)
+
+
+def with_document(at: int, mutate: Callable[[dict[str, Any]], None]) -> list[Sent]:
+    document = copy.deepcopy(TRUE[at].document)
+    mutate(document)
+    assert document != TRUE[at].document
+    return [*TRUE[:at], TRUE[at]._replace(document=document), *TRUE[at + 1 :]]
+
+
+def without(topic: str, step: int) -> list[Sent]:
+    return [m for m in TRUE if not (m.topic == topic and m.document["step"] == step)]
+
+
+def reason(topic_ends: str, *, before: int = AWAY.start - 25) -> tuple[int, str, str, int]:
+    """Where an event stands, who says it, about what, and of which early step, far from anybody's absence."""
+    for at, sent in enumerate(TRUE):
+        if sent.document.get("kind") in ("late", "silent") and sent.document["about"].endswith(topic_ends):
+            for step in sent.document["steps"]:
+                if step < before:
+                    return at, sent.who.removeprefix("node-"), sent.document["about"], step
+    raise AssertionError("the run has no such substitution")
+
+
+def assert_found(verdict: Verdict, *, step: int, node: str | None, field: str, proof: int) -> None:
+    first = verdict.first_divergence
+    assert verdict.exit_code == 1, verdict.text()
+    assert first is not None
+    assert (first.step, first.node, first.field, first.proof) == (step, node, field, proof)
+    assert first.gap > verdict.tolerance
+
+
+# what is true is believed
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("gains", [HIDDEN, REAL, SEEN], ids=["hidden", "real", "seen"])
+def test_a_faulty_run_is_reproduced_exactly(tmp_path: Path, gains: Gains, fault: str) -> None:
+    sent = faulty(gains, **FAULTS[fault])
+    verdict = verdict_of(tmp_path, sent, gains)
+    assert verdict.exit_code == 0, verdict.text()
+    assert all(proof.holds and proof.compared for proof in verdict.proofs)
+    pacing = verdict.pacing
+    assert pacing is not None
+    assert pacing.pairs_substituted > 0.02 * pacing.pairs
+    assert pacing.measurements_substituted > 0
+    assert bool(pacing.beginnings) == (fault in ("node away", "both away"))
+    assert bool(pacing.pairs_lost) == bool(gains.problem.links)
+
+
+def test_a_run_without_faults_has_none(tmp_path: Path) -> None:
+    verdict = verdict_of(tmp_path, PacedRun(HIDDEN, steps=STEPS).messages)
+    assert verdict.exit_code == 0, verdict.text()
+    assert verdict.pacing is not None
+    assert (verdict.pacing.pairs_substituted, verdict.pacing.measurements_substituted, verdict.pacing.reasons) == (
+        0,
+        0,
+        {},
+    )
+    assert "0 of " in verdict.text()
+
+
+def by_sensors(sent: list[Sent]) -> list[Sent]:
+    """The same without a plant: every measurement is from a sensor."""
+    return [
+        m._replace(who=f"sensor-{m.topic.split('/')[1]}") if m.topic.endswith("measurement") else m
+        for m in sent
+        if m.topic != "plant/state"
+    ]
+
+
+def test_without_a_plant_estimates_are_compared(tmp_path: Path) -> None:
+    """Every measurement from a sensor, some of which never came."""
+    sent = by_sensors(TRUE)
+    lost = {
+        (m.topic.replace("estimate", "measurement"), m.document["step"])
+        for m in TRUE
+        if m.document.get("measured") is False
+    }
+    sent = [m for m in sent if (m.topic, m.document["step"]) not in lost]
+    verdict = verdict_of(tmp_path, sent, external="n0,n1,n2,n3")
+    assert verdict.exit_code == 0, verdict.text()
+    assert [proof.holds for proof in verdict.proofs] == [True, True, True, True, None]
+    shifted = changed("node/n2/estimate", 12, lambda document: document["x_hat"].__setitem__(0, 1.0))
+    (tmp_path / "run.mcap").unlink()
+    verdict = verdict_of(tmp_path, by_sensors(shifted), external="n0,n1,n2,n3")
+    assert_found(verdict, step=12, node="n2", field="x_hat[0]", proof=2)
+
+
+# mutants: substitutions
+def test_a_substitution_without_a_reason_is_found(tmp_path: Path) -> None:
+    at, who, _, step = reason("estimate")
+    verdict = verdict_of(tmp_path, with_document(at, lambda d: d["steps"].remove(step)))
+    assert_found(verdict, step=step + 1, node=who, field="heard", proof=1)
+
+
+def test_a_measurement_that_was_refused_without_a_reason_is_found(tmp_path: Path) -> None:
+    at, who, _, step = reason("measurement")
+    verdict = verdict_of(tmp_path, with_document(at, lambda d: d["steps"].remove(step)))
+    assert_found(verdict, step=step, node=who, field="measured", proof=1)
+
+
+def test_a_reason_for_what_was_used_is_found(tmp_path: Path) -> None:
+    """An event that names a step in which the pair went into the estimate."""
+    at, who, about, step = reason("estimate")
+    sender = about.split("/")[1]
+    other = next(k for k in range(3, 28) if k != step and sender in document_of(f"node/{who}/estimate", k + 1)["heard"])
+    verdict = verdict_of(tmp_path, with_document(at, lambda d: d["steps"].append(other)))
+    assert_found(verdict, step=other + 1, node=who, field="heard", proof=1)
+
+
+def test_a_late_pair_that_was_used_is_found(tmp_path: Path) -> None:
+    """Whether the node admits it or not: here it computes with it, and says that it did not."""
+    _, who, about, step = reason("estimate")
+    sender, problem = about.split("/")[1], HIDDEN.problem
+    mode = document_of("mode", step)["mode"]
+    mine, theirs = document_of(f"node/{who}/estimate", step), document_of(about, step)
+    K, H = HIDDEN.K[mode][who][sender], HIDDEN.H[mode][who][sender]
+    a = problem.topologies[problem.mode_index(mode)].adjacency[problem.node_index(who), problem.node_index(sender)]
+    more = a * (K @ np.subtract(theirs["x_hat"], mine["x_hat"]) + H @ theirs["innovation"])
+
+    def use(document: dict[str, Any]) -> None:
+        document["x_hat"] = np.add(document["x_hat"], more).tolist()
+
+    topic = f"node/{who}/estimate"
+    verdict = verdict_of(tmp_path, changed(topic, step + 1, use))
+    assert_found(verdict, step=step + 1, node=who, field="x_hat[0]", proof=2)
+    (tmp_path / "run.mcap").unlink()
+    verdict = verdict_of(tmp_path, changed(topic, step + 1, lambda d: d["heard"].append(sender)))
+    first = verdict.first_divergence
+    assert first is not None
+    assert (first.step, first.node) == (step + 1, who)
+
+
+def test_a_late_measurement_that_was_used_is_found(tmp_path: Path) -> None:
+    """With `measured` false an innovation other than 0, and with 0 the claim that it was measured."""
+    _, who, _, step = reason("measurement")
+    topic = f"node/{who}/estimate"
+    verdict = verdict_of(tmp_path, changed(topic, step, lambda d: d["innovation"].__setitem__(0, 1e-9)))
+    assert_found(verdict, step=step, node=who, field="innovation[0]", proof=1)
+    (tmp_path / "run.mcap").unlink()
+    verdict = verdict_of(tmp_path, changed(topic, step, lambda d: d.pop("measured")))
+    assert verdict.exit_code == 1
+    assert verdict.first_divergence is not None
+    assert (verdict.first_divergence.step, verdict.first_divergence.node) == (step, who)
+
+
+# mutants: beginnings and absences
+def test_a_beginning_from_nowhere_is_found(tmp_path: Path) -> None:
+    """An estimate that is not its origin's, by the last bit; another origin; none at all; no event."""
+    topic, step = "node/n1/estimate", AWAY.stop
+    assert document_of(topic, step)["origin"] not in ("", ZERO_STATE)
+    others: list[Callable[[dict[str, Any]], Any]] = [
+        lambda d: d["x_hat"].__setitem__(0, math.nextafter(d["x_hat"][0], 9.0)),
+        lambda d: d.update(origin=ZERO_STATE),
+        lambda d: d.update(origin="n1"),
+        lambda d: d.update(origin="nobody"),
+        lambda d: d.pop("origin"),
+    ]
+    for mutate in others:
+        verdict = verdict_of(tmp_path, changed(topic, step, mutate))
+        assert verdict.exit_code == 1
+        (tmp_path / "run.mcap").unlink()
+    silent = [m for m in TRUE if m.document.get("kind") != "began"]
+    assert_found(verdict_of(tmp_path, silent), step=step, node="n1", field="origin", proof=1)
+
+
+def test_a_node_that_was_there_cannot_begin_again_unnoticed(tmp_path: Path) -> None:
+    """A jump to a neighbour's estimate in the middle of a run."""
+    theirs = document_of("node/n2/estimate", 20)
+
+    def jump(document: dict[str, Any]) -> None:
+        document.update(
+            x_hat=theirs["x_hat"],
+            z_hat=theirs["z_hat"],
+            mode="",
+            heard=[],
+            measured=False,
+            origin="n2",
+            innovation=[0.0],
+        )
+
+    verdict = verdict_of(tmp_path, changed("node/n0/estimate", 20, jump))
+    assert_found(verdict, step=20, node="n0", field="origin", proof=1)
+
+
+@pytest.mark.parametrize("part", ["mode", "plant/state", "node/n0/measurement", "node/n2/estimate", "node/n1/estimate"])
+def test_a_dropped_message_of_somebody_who_was_there_is_missing(tmp_path: Path, part: str) -> None:
+    """Absences excuse what falls into them, and nothing else."""
+    verdict = verdict_of(tmp_path, without(part, 20))
+    assert verdict.exit_code == 1
+    assert (verdict.missing.total, verdict.missing.first) == (1, ((part, 20),)), verdict.text()
+
+
+def test_a_plant_that_comes_back_with_another_state_is_found(tmp_path: Path) -> None:
+    sent = faulty(HIDDEN, **FAULTS["plant away"])
+    moved = [
+        m._replace(document={**m.document, "x": [value + 1e-9 for value in m.document["x"]]})
+        if m.topic == "plant/state" and m.document["step"] == AWAY.stop
+        else m
+        for m in sent
+    ]
+    verdict = verdict_of(tmp_path, moved)
+    assert verdict.first_divergence is not None
+    assert (verdict.first_divergence.step, verdict.first_divergence.node) == (AWAY.stop, None)
+    assert verdict.first_divergence.field == "x[0]"
+
+
+def test_what_a_killed_node_could_not_explain_is_named(tmp_path: Path) -> None:
+    """Its reasons went with its process: the run agrees, and the step is named as unexplained."""
+    told = {
+        (step, m.document["about"])
+        for m in TRUE
+        if m.who == "node-n1" and m.document.get("kind") in ("late", "silent", "gone")
+        for step in m.document["steps"]
+    }
+    weather, asked = Weather(1), {}
+    PacedRun(HIDDEN, steps=STEPS, delay=lambda *place: asked.setdefault(place, weather(*place)), **FAULTS["node away"])
+    unsaid = {
+        step
+        for (receiver, topic, step), delay in asked.items()
+        if receiver == "n1" and delay > 0.08 and step < AWAY.start and (step, topic) not in told
+    }
+    verdict = verdict_of(tmp_path, TRUE)
+    assert verdict.exit_code == 0, verdict.text()
+    pacing = verdict.pacing
+    assert pacing is not None
+    assert 0 < pacing.unexplained_total <= len(unsaid)
+    assert set(pacing.unexplained) <= {f'node "n1" at step {step}' for step in unsaid}
+    assert f"unexplained: {pacing.unexplained_total} (" in verdict.text()
+
+
+@pytest.mark.parametrize("cut", [200, 333, 507])
+def test_a_cut_file_agrees_as_far_as_it_goes(tmp_path: Path, cut: int) -> None:
+    """What nodes had not told yet is named, and held against nobody."""
+    path = record(tmp_path / "run.mcap", HIDDEN, TRUE[:cut], steps=STEPS, whole=False, period="0.1")
+    verdict = replay(path)
+    assert (verdict.agrees, verdict.exit_code) == (True, 3), verdict.text()
+    assert verdict.pacing is not None
+    assert verdict.pacing.unexplained_total > 0
+
+
+def test_a_file_without_events_explains_nothing_and_accuses_nobody(tmp_path: Path) -> None:
+    sent = [m for m in faulty(HIDDEN) if m.topic not in ("event", "account")]
+    verdict = verdict_of(tmp_path, sent)
+    assert (verdict.agrees, verdict.exit_code) == (True, 3), verdict.text()
+    assert verdict.pacing is not None
+    assert verdict.pacing.unexplained_total > 10
+
+
+# mutants: the step, as in lock-step
+@pytest.mark.parametrize(("node", "step"), [("n0", 1), ("n1", AWAY.stop + 1), ("n3", STEPS - 1)])
+def test_a_millionth_in_an_estimate_is_found(tmp_path: Path, node: str, step: int) -> None:
+    def shift(document: dict[str, Any]) -> None:
+        document["x_hat"][1] += 1e-6
+
+    verdict = verdict_of(tmp_path, changed(f"node/{node}/estimate", step, shift))
+    assert_found(verdict, step=step, node=node, field="x_hat[1]", proof=2)
+
+
+def test_a_run_of_another_seed_is_found(tmp_path: Path) -> None:
+    verdict = verdict_of(tmp_path, faulty(REAL, seed=2), REAL, seed="1")
+    assert verdict.exit_code == 1
+    assert verdict.first_divergence is not None
+    assert verdict.first_divergence.proof == 1
+
+
+def test_a_lock_step_run_may_not_say_what_paced_runs_say(tmp_path: Path) -> None:
+    sent = simulate(HIDDEN, steps=STEPS)
+    at = next(i for i, m in enumerate(sent) if m.topic == "node/n2/estimate" and m.document["step"] == 9)
+    sent[at] = sent[at]._replace(document={**sent[at].document, "measured": False})
+    verdict = replay(record(tmp_path / "run.mcap", HIDDEN, sent, steps=STEPS))
+    assert verdict.exit_code == 1
+    assert verdict.strange == ("node/n2/estimate, step 9: it says what only paced runs have to say",)
+
+
+def test_a_paced_run_that_is_passed_off_as_lock_step_is_found(tmp_path: Path) -> None:
+    assert verdict_of(tmp_path, TRUE, period="0").exit_code == 1
