@@ -158,6 +158,12 @@ class Verdict:
         return all(proof.holds is not False for proof in self.proofs)
 
     @property
+    def complete(self) -> int:
+        """Steps from the beginning of which every message is there."""
+        holes = [place.step for faults in (self.missing, self.lacking) for place in faults.first]
+        return min([self.steps, *holes])
+
+    @property
     def compared(self) -> int:
         """Numbers and names that were compared."""
         return sum(proof.compared for proof in self.proofs if proof.number <= 3)
@@ -193,6 +199,7 @@ class Verdict:
             "seed": self.seed,
             "steps": self.steps,
             "planned": self.planned,
+            "complete_steps": self.complete,
             "messages": self.messages,
             "worst_gap": self.worst_gap,
             "worst": self.worst.document() if self.worst else None,
@@ -267,6 +274,8 @@ class Verdict:
         if self.gaps:
             how = "not in this file" if self.status in ("cut", "continues") or self.damage else "left out of this file"
             lines.append(f"{how}: {counted(self.lacking.total, 'message')} ({'; '.join(self.gaps)})")
+        if self.gaps or self.damage:
+            lines.append(f"the last complete step is {self.complete - 1}" if self.complete else "no step is complete")
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
     def _proofs(self) -> list[str]:

@@ -11,6 +11,7 @@ from made_recordings import random_gains, random_problem, simulate
 
 from agent.contract.errors import PeakmeshError
 from agent.contract.files import canonical
+from agent.contract.keys import data_topics, decode
 from agent.contract.messages import Stamp, digest_of
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
@@ -21,6 +22,7 @@ from designer.replay import replay
 
 GAINS = random_gains(random_problem(5, ny=(1, 2), modes=2))
 STEPS = 60
+DATA = data_topics(GAINS.problem)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +60,19 @@ def said_of(path: Path, truth: set[Logged]) -> str:
     assert verdict.exit_code == 3
     assert damage
     assert damage in verdict.text()
+    assert verdict.complete == complete(messages, truth)
+    assert not verdict.complete or f"the last complete step is {verdict.complete - 1}" in verdict.text()
     return "named"
+
+
+def complete(messages: list[Logged], truth: set[Logged]) -> int:
+    """Steps from the beginning of which every message was read."""
+    due, there = (Counter(step_of(logged) for logged in of if logged.topic in DATA) for of in (truth, messages))
+    return next((step for step in range(STEPS) if there[step] < due[step]), STEPS)
+
+
+def step_of(logged: Logged) -> int:
+    return decode(logged.topic, logged.payload).step
 
 
 def contents(recording: Path) -> tuple[bytes, set[Logged]]:
