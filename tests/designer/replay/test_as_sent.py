@@ -107,7 +107,7 @@ def test_parts_are_one_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """What the recorder writes in parts replays as one run; a message changed in one of them is named."""
     monkeypatch.setattr(writer, "FLUSH_SECONDS", 0.0)
     run = {"run": "test", "seed": "1", "steps": str(STEPS), "gains": GAINS.digest(), "external": ""}
-    with Record(tmp_path / "run.mcap", run=run, gains=GAINS, force=False, split=Split(size=5000)) as kept:
+    with Record(tmp_path / "run.mcap", run=run, gains=GAINS, force=False, split=Split(size=6500)) as kept:
         for sent in simulate(GAINS, steps=STEPS):
             payload = canonical(sent.document)
             stamp = Stamp(sent.number, 0, sent.who, digest_of(sent.topic, payload))
