@@ -84,7 +84,7 @@ def _faults(account: Account) -> Iterator[str]:
         if faults.total:
             first = ", ".join(f"{place.topic} step {place.step}" for place in faults.first[:NAMED])
             yield f"{word}: {counted(faults.total, 'message')}; first {first}."
-    for fault in (*verdict.strange, *verdict.numbering)[:NAMED]:
+    for fault in (*verdict.strange, *verdict.numbering, *verdict.evidence.wrong)[:NAMED]:
         yield f"{fault}."
     for note in verdict.notes:
         yield f"Note: {note}."

@@ -72,8 +72,8 @@ def _what_is_wrong(verdict: Verdict) -> str:
             first = faults.first[0]
             where = f"the first is {first.topic} of step {first.step}"
             return f"{counted(faults.total, 'message')} {_are(faults.total)} {word}; {where}"
-    for fault in (*verdict.strange, *verdict.numbering):
-        return fault
+    for fault in (*verdict.strange, *verdict.numbering, *verdict.evidence.wrong):
+        return str(fault)
     return "the errors were larger than a disturbance of this size can make them"
 
 

@@ -15,6 +15,7 @@ import pytest
 from made_recordings import random_gains, random_problem, record, simulate
 from places import GOLDEN
 from reports import account_of, recorded
+from rewriting import read, write
 
 from designer.ladder import rounded_up
 from designer.report.account import Account
@@ -191,6 +192,19 @@ def test_a_missing_message_is_named_and_a_cut_file_is_not_accused(tmp_path: Path
     assert said in Checked(page(cut)).text
 
 
+def test_a_message_that_is_not_what_was_sent_is_named(tmp_path: Path) -> None:
+    """By its sender, whatever it says: spaces in its JSON change no number."""
+    contents = read(recorded(tmp_path))
+    items = list(contents.items)
+    at = next(i for i, item in enumerate(items) if item.topic == "plant/state" and b'"step":7,' in item.payload)
+    items[at] = items[at]._replace(payload=items[at].payload + b" ")
+    account = Account.of(write(tmp_path / "altered.mcap", contents.with_items(items)))
+    said = verdict_sentence(account.verdict)
+    assert said.startswith("This recording is not a true account of the run: the plant, number ")
+    assert "(plant/state, step 7)" in said
+    assert said in Checked(page(account)).text
+
+
 def test_what_a_filter_left_out_is_named_and_accuses_nobody(tmp_path: Path) -> None:
     """A whole topic that is not there."""
     gains = random_gains(random_problem(3))
@@ -206,7 +220,7 @@ def test_parts_of_a_run_are_one_report(tmp_path: Path) -> None:
     gains = random_gains(random_problem(3))
     sent = simulate(gains, steps=20)
     halves = [
-        record(tmp_path / f"{name}.mcap", gains, half, steps=20)
+        record(tmp_path / f"{name}.mcap", gains, half, steps=20, evidence=False)
         for name, half in (("first", sent[:90]), ("second", sent[90:]))
     ]
     account = Account.of(*halves)
