@@ -98,7 +98,11 @@ class Examiner:
         """The findings, after the last message; `end` is the metadata of that name, empty where it is missing."""
         senders = [sender for _, sender in sorted(self._senders.items())]
         for sender in senders:
-            sender.finish(end.get(f"head.{sender.who}", ""))
+            sender.settle()
+        is_renumbered = any(sender.is_renumbered for sender in senders)
+        for sender in senders:  # a tool that numbers anew does so with everybody's messages
+            sender.is_renumbered = is_renumbered
+            sender.judge(end.get(f"head.{sender.who}", ""))
         return Findings(
             checked=sum(sender.checked for sender in senders),
             total=sum(sender.total for sender in senders),
@@ -119,8 +123,8 @@ class Examiner:
             if messages := sum(sender.unchecked for sender in some):
                 of = _named([sender for sender in some if sender.unchecked])
                 yield f"{reason} for {counted(messages, 'message')} of {of}"
-        if renumbered := [sender for sender in senders if sender.is_renumbered]:
-            yield f"the numbers of {_named(renumbered)} were rewritten; messages are known by content alone"
+        if any(sender.is_renumbered for sender in senders):
+            yield "the senders' numbers were rewritten; messages are known by content alone"
         if self._unreadable:
             yield f"{counted(self._unreadable, 'message')} of evidence cannot be read"
 

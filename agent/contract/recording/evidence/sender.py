@@ -89,6 +89,7 @@ class Sender:
         self._blocks: dict[int, Block] = {}  # by their first number
         self._next, self._head = 0, FIRST_HEAD  # the number after the last block, and the head there
         self._moves = _Moves()
+        self._left: list[tuple[Seen, bool]] = []  # what has no evidence in the end, and whether it is a copy
 
     @property
     def has_evidence(self) -> bool:
@@ -155,17 +156,26 @@ class Sender:
         if len(self.wrong) < NAMED:
             self.wrong.append(finding)
 
-    def finish(self, end_head: str) -> None:
-        """Judge what is left when everything has been taken in; `end_head` is the chain's last, "" if not known."""
+    def settle(self) -> None:
+        """When everything has been taken in: find the evidence of what came after it, and see whose numbers these are.
+
+        To be followed by `judge`, once it is known whether a tool has numbered the messages of anybody anew.
+        """
         if self.has_two_runs:
             self.checked, self.total, self.wrong = 0, 0, []
         if self.has_two_runs or self.has_given_up:
             self.unchecked = self.taken - self.checked
             self.absent.clear()
             return
-        left = self._settle()
-        sent, self.is_renumbered = self._sent(end_head), self._moves.rewritten(self.checked)
-        for seen, copy in left:
+        self._left = self._settle()
+        self.is_renumbered = self._moves.rewritten(self.checked)
+
+    def judge(self, end_head: str) -> None:
+        """Judge what is left; `end_head` is the chain's last, "" if not known."""
+        if self.has_two_runs or self.has_given_up:
+            return
+        sent = self._sent(end_head)
+        for seen, copy in self._left:
             if copy and (self.is_renumbered or seen.number not in self.absent):
                 continue  # the true one is there too
             kind = self._fault(seen, sent)
