@@ -23,7 +23,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel, error_model, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.theorem1 import check
+from designer.proof.by_balls import check
 
 Form = Literal["structured", "full"]
 

@@ -15,7 +15,7 @@ from designer.lmi.back_off import Confirmed, back_off, least_gamma, satisfies_17
 from designer.lmi.inwards import inwards
 from designer.lmi.recovery import block_diagonal, links, unconfirmed
 from designer.model.error_model import error_model, stacked_links
-from designer.proof.theorem1 import check
+from designer.proof.by_balls import check
 
 
 class Designed(NamedTuple):

@@ -1,7 +1,7 @@
 """The certificate proved again, without a solver: mean-square stability, and gamma, for the numbers of the gains file.
 
 Every inequality is proved for the exact matrices that the file's floats stand for, in ball arithmetic
-(designer.proof.balls). Kind "lyapunov" is Theorem 1 (designer.proof.theorem1), kind "exact" the recursion of the exact
+(designer.proof.balls). Kind "lyapunov" is Theorem 1 (designer.proof.by_balls), kind "exact" the recursion of the exact
 gain (designer.proof.recursion).
 """
 
@@ -15,7 +15,7 @@ from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.proof.findings import Verdict
 from designer.proof.recursion import check_exact
-from designer.proof.theorem1 import check
+from designer.proof.by_balls import check
 
 MOST_STEPS = 1_000_000  # of a recursion that is proved; designs need fewer even where errors hardly decay
 

@@ -23,7 +23,7 @@ from agent.contract.problem import Problem
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import UNDECIDED, Sign, above, below, diagonal, floats, identity, part, sign
 from designer.proof.findings import Finding, Verdict, decided
-from designer.proof.theorem1 import inequality_17, symmetric
+from designer.proof.by_balls import inequality_17, symmetric
 
 Modes = tuple[str, ...]
 Rounding = Callable[[arb_mat], arb_mat]  # above or below

@@ -27,7 +27,7 @@ from designer.model.error_model import error_model, link_gains
 from designer.model.units import natural_units
 from designer.problems import find
 from designer.proof.certificate import verify
-from designer.proof.theorem1 import check
+from designer.proof.by_balls import check
 from designer.synthesis import design
 
 PAPER = [

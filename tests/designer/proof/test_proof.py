@@ -26,11 +26,11 @@ from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
-from designer.proof import balls, findings, recursion, theorem1
+from designer.proof import balls, by_balls, findings, recursion
 from designer.proof.ball_model import BallModel, Noise, Sensor
 from designer.proof.balls import above, below, exact, floats, sign
 from designer.proof.certificate import lyapunov_matrix, verify
-from designer.proof.theorem1 import check, symmetric
+from designer.proof.by_balls import check, symmetric
 from designer.search.starts import consensus_gains
 
 Document = dict[str, Any]
@@ -479,7 +479,7 @@ def test_the_blocks_of_P_change_nothing(variant: dict[str, Any]) -> None:
     zero = np.zeros((2, problem.n * problem.nx, problem.n * problem.nx))
     model = BallModel(problem, *link_gains(problem, zero + 0.1, random_gains(problem, 7)[1]))
     P = partly_joined(problem)
-    P_balls, found = symmetric(P), theorem1._blocks(model, P)
+    P_balls, found = symmetric(P), by_balls._blocks(model, P)
     joined = [block for block in found if model.e[0][0] in block]
     assert joined == [model.e[0] + model.e[1]]
     assert sorted(k for block in found for k in block) == model.eta
@@ -500,7 +500,7 @@ def test_18_sees_what_joins_the_states_of_a_node() -> None:
     zero = np.zeros((1, 4, 4))
     model = BallModel(problem, *link_gains(problem, zero, zero[:, :, :2]))
     for p, proved in ((1.5, False), (2.5, True)):
-        (finding,) = theorem1._inequality_18(model, problem.mode_names, p * np.eye(6)[None], 1.0)
+        (finding,) = by_balls._inequality_18(model, problem.mode_names, p * np.eye(6)[None], 1.0)
         assert (finding.sign.proved, finding.sign.refuted) == (proved, not proved)
 
 
