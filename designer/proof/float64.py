@@ -6,7 +6,7 @@ products keep to it. Nothing is assumed of LAPACK: it finds factors and eigenvec
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,9 +50,14 @@ def symmetric(S: Array) -> Array:
     return np.asarray((S + S.swapaxes(-1, -2)) * 0.5)
 
 
+def product(A: Any, B: Any) -> Array:
+    """A B, A dense or sparse. All products of a proof are taken here: what is assumed of them is in docs/theory.md."""
+    return np.asarray(A @ B)
+
+
 def times(A: Array, x: Array) -> Array:
     """A x for matrices (..., m, n) and vectors (..., n)."""
-    return np.asarray((A @ x[..., None])[..., 0])
+    return product(A, x[..., None])[..., 0]
 
 
 def raised(S: Bounded, *, up: bool) -> Array:
@@ -77,17 +82,20 @@ def quotient(J: Array, W: Array, least: Array) -> Bounded | None:
     """
     n, nw = J.shape[-1] - W.shape[-1], W.shape[-1]
     J_11, J_12, J_21 = J[..., :n, :n], J[..., :n, n:], J[..., n:, :n]
-    Z = np.linalg.solve(W, J_21)
+    try:
+        Z: Array = np.asarray(np.linalg.solve(W, J_21), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
     if not within(J, W, Z, np.reciprocal(least)):
         return None
     D = weights(J_11.diagonal(axis1=-2, axis2=-1))
     size_J, size_Z, size_Z_T = np.abs(J_12), np.abs(Z), np.abs(Z.swapaxes(-1, -2))
-    size_R = np.abs(J_21 - W @ Z) + relative(nw + 2) * (np.abs(J_21) + np.abs(W) @ size_Z)
+    size_R = np.abs(J_21 - product(W, Z)) + relative(nw + 2) * (np.abs(J_21) + product(np.abs(W), size_Z))
     Z_D, R_D = times(size_Z, D), times(size_R, D)
-    product = 0.5 * (times(size_J, Z_D) + times(size_Z_T, times(np.abs(J_21), D)))
-    rounded = relative(nw + 2) * (times(np.abs(J_11), D) + product)
+    J_Z_D = 0.5 * (times(size_J, Z_D) + times(size_Z_T, times(np.abs(J_21), D)))
+    rounded = relative(nw + 2) * (times(np.abs(J_11), D) + J_Z_D)
     left = 0.5 * times(size_Z_T, R_D) + times(size_R.swapaxes(-1, -2), 0.5 * Z_D + R_D / least[:, None])
-    return Bounded(symmetric(J_11 + J_12 @ Z), (rounded + left) / D * UP + TINY)
+    return Bounded(symmetric(J_11 + product(J_12, Z)), (rounded + left) / D * UP + TINY)
 
 
 def sign(S: Bounded, sizes: Array) -> Sign:
@@ -115,12 +123,12 @@ def _floor(Q: Array, shift: Array, least: float) -> float:
     """A bound below the eigenvalues of all matrices within Q -+ diag(shift): by Gershgorin, of Q - LL' for some L."""
     order = len(Q)
     L = np.linalg.cholesky(Q - np.diag(shift + 0.5 * least))
-    rest, size = Q - L @ L.T, np.abs(L)
+    rest, size = Q - product(L, L.T), np.abs(L)
     if not within(rest, size):
         return 0.0
     on = rest.diagonal().copy()
     np.fill_diagonal(rest, 0.0)
-    rounded = relative(order + 2) * (np.abs(Q).sum(axis=1) + size @ size.sum(axis=0))
+    rounded = relative(order + 2) * (np.abs(Q).sum(axis=1) + product(size, size.sum(axis=0)))
     off = (np.abs(rest).sum(axis=1) + rounded + shift) * UP + TINY
     return max(float(np.nextafter(on - off, -np.inf).min()), 0.0)
 
@@ -129,5 +137,6 @@ def _negative(Q: Array, shift: Array) -> bool:
     """Whether some x is proved to have x'Xx < 0 for all matrices X within Q -+ diag(shift)."""
     x = np.linalg.eigh(Q)[1][:, 0]
     size = np.abs(x)
-    rounded = relative(2 * len(x) + 2) * float(size @ (np.abs(Q) @ size))
-    return within(x) and float(x @ (Q @ x)) < -((rounded + float((shift * size) @ size)) * UP + TINY)
+    rounded = relative(2 * len(x) + 2) * float(product(size, product(np.abs(Q), size)))
+    above = float(product(x, product(Q, x)))
+    return within(x) and above < -((rounded + float(product(shift * size, size))) * UP + TINY)

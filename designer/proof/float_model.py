@@ -16,7 +16,7 @@ from scipy import sparse
 
 from agent.contract.arrays import Array
 from designer.proof.ball_model import BallModel
-from designer.proof.float64 import TINY, UP, Bounded, U, relative, symmetric, times, weights, within
+from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 
 Indices = NDArray[np.int64]
 
@@ -65,9 +65,9 @@ class FloatModel:
         S = self.weigh(Y)
         Y_size = self._bar(self.transition.size, np.abs(Y))
         D = weights(S.diagonal(axis1=1, axis2=2))
-        half = times(Y_size, (self.AB.size @ D.reshape(-1)).reshape(self.modes, self.size))
-        rows = (self.AB_T.size @ half.reshape(-1)).reshape(D.shape)
-        by_chance = self.added.size @ (self.cores.size @ Y_size.reshape(-1))
+        half = times(Y_size, product(self.AB.size, D.reshape(-1)).reshape(self.modes, self.size))
+        rows = product(self.AB_T.size, half.reshape(-1)).reshape(D.shape)
+        by_chance = product(self.added.size, product(self.cores.size, Y_size.reshape(-1)))
         of_D = self.at // self.order**2 * self.order + self.at % self.order
         rows += np.bincount(self.at // self.order, by_chance * D.reshape(-1)[of_D], D.size).reshape(D.shape)
         spread = self.rounded * rows / D * UP + TINY
@@ -76,14 +76,14 @@ class FloatModel:
     def weigh(self, Y: Array) -> Array:
         """The middle of S(Y)."""
         Y_bar = self._bar(self.transition.middle, Y)
-        half = (self.AB_T.middle @ Y_bar.reshape(-1, self.size)).reshape(self.modes, self.order, self.size)
-        S = self.AB_T.middle @ half.swapaxes(1, 2).reshape(-1, self.order)
-        S.reshape(-1)[self.at] += self.added.middle @ (self.cores.middle @ Y_bar.reshape(-1))
+        half = product(self.AB_T.middle, Y_bar.reshape(-1, self.size)).reshape(self.modes, self.order, self.size)
+        S = product(self.AB_T.middle, half.swapaxes(1, 2).reshape(-1, self.order)).reshape(-1)
+        S[self.at] += product(self.added.middle, product(self.cores.middle, Y_bar.reshape(-1)))
         return symmetric(S.reshape(self.modes, self.order, self.order))
 
     def _bar(self, transition: Array, Y: Array) -> Array:
         """Y_bar(s) = sum_t pi_st Y(t)."""
-        return np.asarray((transition @ Y.reshape(self.modes, -1)).reshape(Y.shape))
+        return product(transition, Y.reshape(self.modes, -1)).reshape(Y.shape)
 
     @np.errstate(all="ignore")
     def lyapunov(self) -> Array | None:
@@ -155,7 +155,7 @@ class _Entries:
 
     def add(self, rows: Indices, columns: Indices, numbers: Enclosed) -> None:
         """Numbers at these places, all of one shape; what is exactly 0 is left out."""
-        kept = numbers.size > 0.0
+        kept = numbers.size != 0.0  # what is no number stays, and is out of range
         places = (np.broadcast_to(part, kept.shape)[kept] for part in (rows, columns))
         self._parts.append((*places, numbers.middle[kept], numbers.size[kept]))
 
@@ -164,7 +164,9 @@ class _Entries:
         if not self._parts:
             return Enclosed(*2 * [sparse.csr_array(shape)])
         rows, columns, *numbers = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
-        return Enclosed(*(sparse.csr_array((part, (rows, columns)), shape=shape) for part in numbers))
+        found = Enclosed(*(sparse.csr_array((part, (rows, columns)), shape=shape) for part in numbers))
+        assert found.size.nnz == len(rows), "a place twice: its sum would be rounded, and not counted"
+        return found
 
 
 def _fullest(matrix: Enclosed) -> int:

@@ -15,8 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from agent.contract.arrays import Array
-from designer.proof.float64 import U
-
+from designer.proof.float64 import U, product
 
 _LARGEST = 400  # order that is looked at: 0.1 s
 
@@ -27,8 +26,8 @@ def fault(order: int) -> str | None:
     if not _rounds():
         return "an operation on two float64 numbers is off by more than one unit in the last place"
     order = min(order, _LARGEST)
-    for name, product, exact in _products(order):
-        if not np.array_equal(product, exact):
+    for name, computed, exact in _products(order):
+        if not np.array_equal(computed, exact):
             return f"{name} of order {order} is not as exact as a sum of rounded products"
     return None
 
@@ -55,11 +54,11 @@ def _products(order: int) -> list[tuple[str, Array, Array]]:
     A, exact, exact_apart = whole.astype(np.float64), whole @ whole.T, (apart @ apart.T) * far * far[:, None]
     left, right, factor = A * powers, A.T / powers[:, None], apart * far
     found = [
-        ("a matrix product", A @ A.T, exact),
-        ("a matrix product", left @ right, exact),
-        ("a matrix product", factor @ factor.T, exact_apart),
-        ("a matrix product", np.stack([left, left]) @ right, np.stack([exact, exact])),
-        ("a matrix times a vector", left @ right[:, 0], exact[:, 0]),
-        ("a sparse matrix product", sparse.csr_array(left) @ right, exact),
+        ("a matrix product", product(A, A.T), exact),
+        ("a matrix product", product(left, right), exact),
+        ("a matrix product", product(factor, factor.T), exact_apart),
+        ("a matrix product", product(np.stack([left, left]), right), np.stack([exact, exact])),
+        ("a matrix times a vector", product(left, right[:, 0]), exact[:, 0]),
+        ("a sparse matrix product", product(sparse.csr_array(left), right), exact),
     ]
-    return [(name, product, np.asarray(truth, dtype=np.float64)) for name, product, truth in found]
+    return [(name, computed, np.asarray(truth, dtype=np.float64)) for name, computed, truth in found]
