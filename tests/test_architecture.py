@@ -41,7 +41,7 @@ ROOMS = {
     "designer.diagnosis": "",
     "designer.ladder": "designer.lmi",
     "designer.workers": "",
-    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.search",
+    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
     "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
@@ -65,7 +65,7 @@ DOORS = {
     "zstandard": ["agent/contract/recording/"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": ["designer/lmi/", "designer/gain/exact.py"],
+    "scipy": ["designer/lmi/", "designer/gain/exact.py", "designer/proof/float_model.py", "designer/proof/machine.py"],
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/"],
     "rich": ["agent/commands/words.py", "designer/commands/"],
@@ -274,7 +274,7 @@ def loaded(modules: str) -> set[str]:
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver
-        ("designer.proof.certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
+        ("designer.proof.certificate", "cvxpy clarabel scipy.optimize agent.filter zenoh mcap matplotlib"),
     ],
 )  # fmt: skip
 def test_a_process_loads_only_what_it_needs(modules: str, never: str) -> None:

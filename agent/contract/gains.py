@@ -57,6 +57,11 @@ class Certificate(Model):
     verified: str  # what was verified, and how
     margins: dict[str, Number]  # by how much each inequality holds; all positive where it does
 
+    @property
+    def by_theorem1(self) -> float | None:
+        """The gamma that (17) and (18) prove, for a P that is stored."""
+        return self.gamma if self.kind == "lyapunov" else self.theorem1_gamma
+
     @model_validator(mode="after")
     def _check_claims(self) -> Self:
         if self.theorem1_gamma is not None and (self.kind != "exact" or self.form == "summed"):

@@ -38,8 +38,8 @@ def within(*arrays: Array) -> bool:
 
 
 def weights(sizes: Array) -> Array:
-    """Powers of two, about 1 / sqrt(size) and within 2^50 of each other: what scales a matrix to about 1, exactly."""
-    sizes = np.where(np.isfinite(sizes), sizes, 0.0)
+    """Powers of two, about 1 / sqrt |size| and within 2^50 of each other: what scales a matrix to about 1, exactly."""
+    sizes = np.where(np.isfinite(sizes), np.abs(sizes), 0.0)
     top = sizes.max(axis=-1, keepdims=True, initial=0.0)
     sizes = np.maximum(sizes, np.where(top > 0.0, 2.0**-100 * top, 1.0))
     return np.asarray(np.ldexp(1.0, np.rint(-0.5 * np.log2(sizes)).astype(np.int64)))
@@ -106,7 +106,7 @@ def sign(S: Bounded, sizes: Array) -> Sign:
 @np.errstate(all="ignore")  # what is not finite decides nothing
 def bounded_below(S: Bounded, sizes: Array) -> tuple[Sign, float]:
     """The sign of the exact matrix, and a proved lower bound of its least eigenvalue: 0 where none is proved."""
-    if not within(S.middle, S.spread, sizes, 1.0 / sizes.max(initial=0.0)):
+    if not within(S.middle, S.spread, sizes, 1.0 / np.abs(sizes).max(initial=0.0)):
         return UNDECIDED, 0.0
     D = weights(sizes)
     Q, shift = S.middle * D * D[:, None], S.spread * D * D + TINY  # exact, but for underflow
