@@ -29,11 +29,14 @@ from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
-from designer.proof import balls, by_balls, findings
+from designer.proof import balls, by_balls, findings, prover
+from designer.proof import recursion as recursion_module
 from designer.proof.ball_model import BallModel, Noise, Sensor
 from designer.proof.balls import above, below, exact, floats, sign
 from designer.proof.by_balls import ByBalls, symmetric
+from designer.proof.by_floats import ByFloats
 from designer.proof.certificate import lyapunov_matrix, verify
+from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, Make, Prover
 from designer.proof.recursion import disproof, recursion
 from designer.search.starts import consensus_gains
@@ -366,6 +369,154 @@ def test_rows_of_the_chain_are_divided_by_their_sums() -> None:
     zero = np.zeros((1, 2, 2))
     (row,) = BallModel(problem, *link_gains(problem, zero, zero)).transition
     assert float(abs(sum(row) - 1)) < 1e-30
+
+
+# both arithmetics
+def mutated_at_random(document: Document, rng: np.random.Generator) -> None:
+    """Gamma, an entry of P, all of P, a gain, the arrivals, or the chain, by anything from 1 to 1e-9."""
+    size = float(rng.choice([-1.0, 1.0]) * 10.0 ** -rng.uniform(0.0, 9.0))
+    problem, certificate = document["problem"], document["certificate"]
+    mode = str(rng.choice(list(certificate["P"])))
+    match int(rng.integers(6)):
+        case 0:
+            certificate["gamma"] *= 1.0 + 0.1 * size
+        case 1:
+            i, j = rng.integers(len(certificate["P"][mode]), size=2)
+            certificate["P"][mode][i][j] *= 1.0 + size
+        case 2:
+            certificate["P"] = {name: ((1.0 + size) * np.array(P)).tolist() for name, P in certificate["P"].items()}
+        case 3:
+            receiver = str(rng.choice(list(document["H"][mode])))
+            sender = str(rng.choice(list(document["H"][mode][receiver])))
+            document["H"][mode][receiver][sender][0][0] += size
+        case 4:
+            for node in problem["node"]:
+                node["arrival_probability"] = float(
+                    np.clip(node["arrival_probability"] * (1.0 + 0.1 * size), 0.01, 1.0)
+                )
+        case 5:
+            chain = np.abs(np.array(problem["markov"]["transition"]) + 0.1 * size * rng.uniform(size=(1, 1)))
+            problem["markov"]["transition"] = (chain / chain.sum(axis=1, keepdims=True)).tolist()
+
+
+def said(verdict: Verdict) -> str:
+    return "proved" if verdict.holds else "false" if "it is false" in str(verdict.failure) else "open"
+
+
+@every_kind
+@every_network
+def test_both_arithmetics_say_the_same_of_mutants(network: str, kind: Kind) -> None:
+    """30 of each certificate, some of which hold still; floats may leave open what balls decide, and nothing else."""
+    rng, answers = np.random.default_rng(len(network)), set()
+    for _ in range(30):
+        mutant = mutated(ALL[network, kind], lambda document: mutated_at_random(document, rng))
+        by_floats, by_balls = (said(verify(mutant, makes=makes)) for makes in (FLOATS, BALLS))
+        assert by_floats in (by_balls, "open")
+        answers.add(by_floats)
+    assert answers >= {"proved", "false"}
+
+
+@every_network
+def test_a_P_that_is_not_stored_is_summed(network: str) -> None:
+    """The same gamma is proved, in both arithmetics; a lower one is false, and so is that of gains that have more."""
+    gains = ALL[network, "exact"]
+    claim = gains.certificate.model_copy(update={"form": "summed", "P": None})
+    summed = gains.model_copy(update={"certificate": claim})
+    assert len(summed.canonical()) < 0.8 * len(gains.canonical())
+    worse = mutated(summed, change_one_measurement_gain)
+    gain = exact_gain(model_of(worse))
+    assert gain.low > gains.certificate.gamma, "this mutant is no mutant"
+    for makes in (FLOATS, BALLS):
+        assert verify(summed, makes=makes).holds
+        assert said(verify(mutated(summed, lower_gamma), makes=makes)) == "false"
+        assert said(verify(worse, makes=makes)) == "false"
+
+
+@every_arithmetic
+def test_gains_that_are_not_stable_have_no_P(makes: Sequence[Make]) -> None:
+    """Their gamma is false if w reaches what grows; with H = 0 no estimate ever leaves 0, and nothing is said."""
+    problem = find("two-nodes")
+    K, H = link_gains(problem, 1.5 * np.eye(2)[None], np.eye(2)[None])
+    idle = Prover(problem, K, link_gains(problem, np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))[1], makes=makes)
+    for prover_of, answer in ((Prover(problem, K, H, makes=makes), "false"), (idle, "open")):
+        assert prover_of.P is None
+        for verdict in (prover_of.exact(10.0), prover_of.theorem1(10.0)):
+            assert said(verdict) == answer
+            why = "recursion fails" if answer == "false" else "no P for (17) was found: as far as floats tell, the "
+            assert str(verdict.failure).startswith(why)
+
+
+@every_arithmetic
+@every_network
+def test_both_claims_are_proved_of_one_P(network: str, makes: Sequence[Make]) -> None:
+    """The exact gain and Theorem 1's bound; each lowered alone is proved false, and named."""
+    exact, theorem1 = ALL[network, "exact"], ALL[network, "lyapunov"].certificate.gamma
+    both = mutated(exact, lambda document: document["certificate"].update(theorem1_gamma=theorem1))
+    verdict = verify(both, makes=makes)
+    assert verdict.holds, verdict.failure
+    assert verdict.gamma == exact.certificate.gamma < theorem1
+    assert {name.split(" mode")[0] for name in verdict.margins} == {"(17)", "(18)", "P > 0", "recursion", "Y < g P"}
+    for field, inequality in (("gamma", "recursion"), ("theorem1_gamma", "(18)")):
+        lower = (exact.certificate.exact or (0.0, 0.0))[0] if field == "gamma" else theorem1
+        claim = both.certificate.model_copy(update={field: lower * (1.0 - 1e-5)})
+        verdict = verify(both.model_copy(update={"certificate": claim}), makes=makes)
+        assert said(verdict) == "false"
+        assert str(verdict.failure).startswith(f"{inequality} fails")
+
+
+def test_theorem_1_is_the_proof_in_no_steps() -> None:
+    """At its own gamma M'M < g P from the start."""
+    for makes in (FLOATS, BALLS):
+        gains = ALL["paper", "lyapunov"]
+        P = lyapunov_matrix(gains)
+        verdict = Prover(gains.problem, gains.K, gains.H, P=P, makes=makes).exact(gains.certificate.gamma)
+        assert verdict.holds
+        assert not any("recursion" in name for name in verdict.margins)
+
+
+@pytest.mark.parametrize("kind", ["lyapunov", "summed"])
+def test_a_second_gamma_needs_a_P_that_is_stored(kind: str) -> None:
+    update = {"kind": "lyapunov"} if kind == "lyapunov" else {"form": "summed", "P": None}
+    with pytest.raises(ValueError, match='theorem1_gamma stands beside the gamma of kind "exact"'):
+        mutated(ALL["paper", "exact"], lambda document: document["certificate"].update(theorem1_gamma=9.0, **update))
+
+
+def test_what_floats_leave_open_is_asked_of_balls_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1e-14 below the exact gain of two nodes that hear nothing; beyond that size one sentence says what is open."""
+    problem = find("two-nodes")
+    K, H = link_gains(problem, np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))
+    P = np.diag([2.0**-6, 2.0**-12, 2.0**-12])[None]
+    gamma = 2.0**6 * (1.0 + 2.0**-52)
+    assert said(Prover(problem, K, H, P=P, makes=FLOATS).theorem1(gamma)) == "open"
+    verdict = Prover(problem, K, H, P=P).theorem1(gamma)
+    assert verdict.holds
+    assert "ball arithmetic" in verdict.arithmetic
+    monkeypatch.setattr(prover, "_LARGEST_INEQUALITY", 2)
+    verdict = Prover(problem, K, H, P=P).theorem1(gamma)
+    assert not verdict.holds
+    assert "(18) fails" in str(verdict.failure)
+    assert "(ball arithmetic, which sees further, is asked up to 2 states of the errors) leaves open" in str(
+        verdict.failure
+    )
+    assert Prover(problem, K, H, P=P, makes=BALLS).theorem1(gamma).holds
+
+
+# the recursion has teeth: with a part of the proof believed, a gamma that is false passes
+@every_arithmetic
+@pytest.mark.parametrize("believed", ["inequality_17", "below"])
+def test_17_and_the_end_of_the_recursion_are_what_refuses(
+    believed: str, makes: Sequence[Make], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A P that is too large is above every Y and not invariant; one that is invariant is not above Y at once."""
+    gains = ALL["real", "exact"]
+    assert gains.certificate.exact is not None
+    gamma, P = 0.5 * gains.certificate.exact[0], lyapunov_matrix(gains)
+    P = 1e6 * P if believed == "inequality_17" else P
+    monkeypatch.setattr(recursion_module, "_seems_below", lambda Y, P, gamma: True)
+    assert said(Prover(gains.problem, gains.K, gains.H, P=P, makes=makes).exact(gamma)) == "false"
+    for arithmetic in (ByFloats, ByBalls):
+        monkeypatch.setattr(arithmetic, believed, lambda self, *given: [balls.Sign(True, False, 1.0)] * 2)
+    assert Prover(gains.problem, gains.K, gains.H, P=P, makes=makes).exact(gamma).holds
 
 
 # the checker has teeth: with a part of the model taken away, what is false passes
