@@ -24,16 +24,20 @@ def verify(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Verdict:
 
     `makes`: in which arithmetic.
     """
-    claim, most = gains.certificate, gains.certificate.horizon
-    _refuse_other_matrices(gains.problem, claim)
-    P = None if claim.form == "summed" else lyapunov_matrix(gains)
+    claim, most, prover = gains.certificate, gains.certificate.horizon, prover_of(gains, makes=makes)
     if most is not None and not 1 <= most <= MOST_STEPS:
         raise InputError(f"certificate: horizon is {most}; a proof takes from 1 to {MOST_STEPS} steps")
-    prover = Prover(gains.problem, gains.K, gains.H, P=P, makes=makes)
     if claim.kind == "lyapunov":
         return prover.theorem1(claim.gamma)
     verdict = prover.exact(claim.gamma, most=MOST_STEPS if most is None else most)
     return verdict if claim.theorem1_gamma is None else verdict.joined(prover.theorem1(claim.theorem1_gamma))
+
+
+def prover_of(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Prover:
+    """For the gains as they are, and the P of their certificate; or its own where that stores none."""
+    _refuse_other_matrices(gains.problem, gains.certificate)
+    P = None if gains.certificate.form == "summed" else lyapunov_matrix(gains)
+    return Prover(gains.problem, gains.K, gains.H, P=P, makes=makes)
 
 
 def lyapunov_matrix(gains: Gains) -> Array:

@@ -60,7 +60,7 @@ class Prover:
             return self._no_P(gamma)
         P, modes = self.P, self._problem.mode_names
         last = self._ask(lambda by: found("(18)", modes, by.inequality_18(P, gamma)), largest=_LARGEST_INEQUALITY)
-        return _verdict(gamma, [self._inequality_17, last])
+        return _verdict(gamma, [self._inequality_17, self._of_P(last)])
 
     def exact(self, gamma: float, *, most: int = MOST_STEPS) -> Verdict:
         """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
@@ -79,14 +79,21 @@ class Prover:
         P, modes = self.P, self._problem.mode_names
         assert P is not None
         answer = self._ask(lambda by: found("(17)", modes, by.inequality_17(P)), largest=_LARGEST_INEQUALITY)
-        return answer if self._given is not None else _nothing_false(answer)
+        return self._of_P(answer)
 
     @cached_property
     def _stability(self) -> list[_Answer]:
         P, modes = self.P, self._problem.mode_names
         assert P is not None
         positive = self._ask(lambda by: found("P > 0", modes, by.positive(P)), largest=_LARGEST_INEQUALITY)
-        return [self._inequality_17, positive if self._given is not None else _nothing_false(positive)]
+        return [self._inequality_17, self._of_P(positive)]
+
+    def _of_P(self, answer: _Answer) -> _Answer:
+        """That a P which nobody claims is none says nothing of the claim."""
+        if self._given is not None:
+            return answer
+        findings = [finding._replace(sign=finding.sign._replace(refuted=False)) for finding in answer.findings]
+        return answer._replace(findings=findings)
 
     def _ask(self, question: Callable[[Arithmetic], list[Finding]], *, largest: int) -> _Answer:
         """The first answer that decides; else the last."""
@@ -116,12 +123,6 @@ class Prover:
             return _verdict(gamma, answers)
         why = "no P for (17) was found: as far as floats tell, the errors are not mean-square stable"
         return Verdict(False, gamma, self._arithmetic(0).name, why, {})
-
-
-def _nothing_false(answer: _Answer) -> _Answer:
-    """That a P which nobody claims is none says nothing of the claim."""
-    findings = [finding._replace(sign=finding.sign._replace(refuted=False)) for finding in answer.findings]
-    return answer._replace(findings=findings)
 
 
 def _verdict(gamma: float, answers: Sequence[_Answer]) -> Verdict:
