@@ -26,7 +26,7 @@ from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_disturbance, worst_policy
 from designer.ladder import Ladder
 from designer.model.error_model import error_model, stacked_links
-from designer.search.exact_design import certify
+from designer.search.exact_design import certify, confirmed
 
 _MOST_COLUMNS = 200  # of w over all steps, in the search for the worst w that is fixed beforehand
 
@@ -62,6 +62,7 @@ class Analysis(NamedTuple):
     fixed: float | None  # the gain to the worst w that is fixed beforehand, from r(0) = initial
     fixed_within: int  # the steps that it was sought over
     w: Array | None  # (at most fixed_within, nw), of energy 1
+    unproved: str | None = None  # why no gamma is certified, where the gain is finite
 
     @property
     def foreign(self) -> bool:
@@ -78,6 +79,7 @@ class Analysis(NamedTuple):
             "stable": self.stable,
             "radius": self.radius if math.isfinite(self.radius) else None,
             "exact": self.ladder.exact,
+            "unproved": self.unproved,
             "horizon": self.horizon,
             "floor": self.ladder.floor,
             "ladder": self.ladder.document(),
@@ -121,6 +123,8 @@ class Analysis(NamedTuple):
         then = f", then w = Gamma [x; e] for {_steps(self.steps - 1)}" if self.steps > 1 else ""
         if given.file is not None and given.file.certificate.holds and not self.foreign:
             lines.append(f"claimed    gamma {given.file.certificate.gamma}; peakmesh verify checks it")
+        if self.unproved is not None:
+            lines.append(f"certified  no gamma: {self.unproved}")
         lines += [
             f"stable     mean-square; each step multiplies E|error|^2 by {self.radius:.6g} in the long run",
             f"exact gain between {low:.8g} and {high:.8g}, from {self.horizon} steps and a bound on the rest",
@@ -173,6 +177,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
     ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)
     if not gain.stable:
         return Analysis(problem, given, False, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
+    verdict = confirmed(problem, given.K, given.H, gain.high)
     policy = worst_policy(model, horizon=gain.horizon)
     within = min(gain.horizon, max(_MOST_COLUMNS // problem.nw, 1))
     fixed = worst_disturbance(model, initial=problem.mode_index(problem.markov.initial), horizon=within)
@@ -182,13 +187,14 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
         stable=True,
         radius=gain.radius,
         horizon=gain.horizon,
-        ladder=ladder,
+        ladder=ladder._replace(gamma=verdict.gamma if verdict.holds else None),
         mode=problem.mode_names[policy.mode],
         steps=len(policy.Gamma) + 1,
         u=policy.u * (-1.0 if policy.u[np.abs(policy.u).argmax()] < 0.0 else 1.0),
         fixed=fixed.gain,
         fixed_within=within,
         w=fixed.w,
+        unproved=verdict.failure,
     )
 
 

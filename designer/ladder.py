@@ -1,4 +1,4 @@
-"""The ladder: floor <= exact gain <= certified gamma, and Theorem 2's bound beside them where it was computed.
+"""The ladder: floor <= exact gain <= certified gamma <= Theorem 1's, and Theorem 2's bound beside them if computed.
 
 Every rung is a peak of the error per root of the energy of w. Theorem 2's bound lies above what its own gains really
 have: that is how loose the bound is. What lies below both is what better gains are worth.
@@ -26,6 +26,7 @@ class Ladder(NamedTuple):
     theorem2_exact: tuple[float, float] | None  # of Theorem 2's gains, where these are others
     theorem2: float | None  # its bound, as the solver gave it
     lmi: str = "Theorem 2"  # what the LMI is called: beyond the paper's model it is not Theorem 2's
+    theorem1: float | None = None  # certified for these gains too, where gamma is less
 
     @property
     def against_theorem2(self) -> float | None:
@@ -52,6 +53,7 @@ class Ladder(NamedTuple):
             (CERTIFIED, self.gamma),
             (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
             (f"{self.lmi}'s bound", self.theorem2),
+            ("what Theorem 1 certifies of these gains", self.theorem1),
         ]
         return [(name, value) for name, value in rungs if value is not None]
 
@@ -81,7 +83,8 @@ def ladder_of(gains: Gains) -> Ladder:
     proved = gains.certificate
     gamma = proved.gamma if proved.holds else None
     lmi = "the LMI" if beyond_paper(gains.problem) else "Theorem 2"
-    return Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi)
+    theorem1 = proved.theorem1_gamma if proved.holds else None
+    return Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi, theorem1)
 
 
 def rounded_up(bound: float) -> str:

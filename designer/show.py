@@ -133,6 +133,7 @@ def _gains(gains: Gains) -> dict[str, Any]:
         "size": _size(gains.problem),
         "method": gains.method,
         "gamma": proved.gamma,
+        "theorem1_gamma": proved.theorem1_gamma,
         "certificate": f"{proved.kind}, {proved.form} P",
         "holds": proved.holds,
         "verified": proved.verified,
@@ -151,13 +152,15 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     if facts["holds"]:
         command = "verify" if facts["kind"] == "gains" else "replay"
         shown["gamma"] = f'claimed {facts["gamma"]}, by design; "peakmesh {command}" checks it'
+    if facts.get("theorem1_gamma") is not None:
+        shown["theorem1_gamma"] = f"claimed {facts['theorem1_gamma']:.6g}"
     if facts.get("lmi_gamma") is not None:
         shown["lmi_gamma"] = f"claimed {facts['lmi_gamma']:.6g}"
     if facts.get("exact"):
         shown["exact"] = "claimed between {:.6g} and {:.6g}".format(*facts["exact"])
     if facts.get("floor") is not None:
         shown["floor"] = f"claimed {facts['floor']:.6g}"
-    absent = {name for name in ("lmi_gamma", "exact", "floor") if facts.get(name) is None}
+    absent = {name for name in ("theorem1_gamma", "lmi_gamma", "exact", "floor") if facts.get(name) is None}
     return {name: value for name, value in shown.items() if name not in {"holds", "verified", *absent}}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from agent.contract.errors import InputError, Unattainable, listed
@@ -13,12 +14,13 @@ from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
 from designer.model.error_model import error_model, stacked_gains
+from designer.proof.certificate import lyapunov_matrix
 from designer.search.descent import Progress
 from designer.search.effort import default_method
-from designer.search.exact_design import design_exact
+from designer.search.exact_design import confirmed, design_exact
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
-_LADDER_STATES = 250  # n nx up to which the exact gain of the LMI's gains is worth its time
+_LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
 def design(problem: Problem, *, method: str | None = None, progress: Callable[[Progress], None] | None = None) -> Gains:
@@ -35,20 +37,40 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
     refuse_nothing_to_estimate(problem)
     refuse_hopeless(problem)
     try:
-        gains = design_exact(problem, progress=progress) if method == EXACT else design_by_lmi(problem, method)
+        if method == EXACT:
+            gains = design_exact(problem, progress=progress)
+        else:
+            gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:
         raise explained(problem, error, _solvable) from None
-    return with_worst_case(_with_ladder(gains))
+    certificate = gains.certificate.model_copy(update={"floor": floor(problem)})
+    return with_worst_case(gains.model_copy(update={"certificate": certificate}))
 
 
-def _with_ladder(gains: Gains) -> Gains:
-    """With the floor, and the exact gain of the gains where their certificate has none and the network is not large."""
+def _with_exact(gains: Gains) -> Gains:
+    """The gains of an LMI with their exact gain; where it is below Theorem 1's gamma it is proved beside that.
+
+    The P that an LMI gave satisfies (17), so it ends the recursion too. Not for networks where that takes too long.
+    """
     problem, certificate = gains.problem, gains.certificate
-    exact = certificate.exact
-    if exact is None and problem.n * problem.nx <= _LADDER_STATES:
-        exact = exact_gain(error_model(problem, *stacked_gains(gains))).bounds
-    certificate = certificate.model_copy(update={"exact": exact, "floor": floor(problem)})
-    return gains.model_copy(update={"certificate": certificate})
+    if problem.n * problem.nx > _LADDER_STATES:
+        return gains
+    started = time.perf_counter()
+    exact = exact_gain(error_model(problem, *stacked_gains(gains))).bounds
+    found: dict[str, object] = {"exact": exact}
+    if exact is not None and exact[1] < certificate.gamma:
+        verdict = confirmed(problem, gains.K, gains.H, exact[1], P=lyapunov_matrix(gains))
+        if verdict.holds and verdict.gamma < certificate.gamma:
+            found |= {
+                "gamma": verdict.gamma,
+                "kind": "exact",
+                "theorem1_gamma": certificate.gamma,
+                "verified": f"{certificate.verified}; the recursion of the exact gain: {verdict.arithmetic}",
+                "margins": certificate.margins | verdict.margins,
+            }
+    spent = time.perf_counter() - started
+    seconds = gains.seconds | {name: gains.seconds[name] + spent for name in ("certify", "total")}
+    return gains.model_copy(update={"certificate": certificate.model_copy(update=found), "seconds": seconds})
 
 
 def _solvable(problem: Problem) -> bool:

@@ -45,7 +45,7 @@ ROOMS = {
     "designer.diagnosis": "",
     "designer.ladder": "designer.lmi",
     "designer.workers": "",
-    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.search",
+    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
     "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
@@ -74,7 +74,13 @@ DOORS = {
     "lz4": ["agent/contract/recording/"],
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
-    "scipy": ["designer/lmi/", "designer/gain/exact.py", "designer/export/matlab.py"],
+    "scipy": [
+        "designer/lmi/",
+        "designer/gain/exact.py",
+        "designer/proof/float_model.py",
+        "designer/proof/machine.py",
+        "designer/export/matlab.py",
+    ],
     "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/"],
@@ -234,7 +240,7 @@ def test_every_door_exists() -> None:
         ("agent/filter.py", "import random", "random"),
         ("agent/inbox.py", "from time import monotonic", "time.monotonic"),
         ("agent/receipts.py", "import threading", "threading"),
-        ("designer/proof/theorem1.py", "import cvxpy as cp", "cvxpy"),
+        ("designer/proof/by_balls.py", "import cvxpy as cp", "cvxpy"),
         ("designer/synthesis.py", "try:\n    import clarabel\nexcept ImportError:\n    pass", "clarabel"),
         ("designer/replay/proofs.py", "from agent.filter import step", "agent.filter.step"),
         ("designer/replay/__init__.py", "from agent import filter", "agent.filter"),
@@ -244,7 +250,7 @@ def test_every_door_exists() -> None:
         ("designer/gain/floor.py", "from designer.lmi import theorem2", "designer.lmi.theorem2"),
         ("designer/proof/balls.py", "import designer.model.error_model", "designer.model.error_model"),
         ("designer/lmi/cones.py", "from designer.search.barrier import Barrier", "designer.search.barrier.Barrier"),
-        ("designer/proof/theorem1.py", "import matplotlib.pyplot", "matplotlib.pyplot"),
+        ("designer/proof/by_balls.py", "import matplotlib.pyplot", "matplotlib.pyplot"),
         ("agent/cli.py", "import numpy", "numpy at once"),
         ("agent/commands/options.py", "from agent.contract.gains import Gains", "agent.contract.gains.Gains at once"),
         ("designer/cli.py", "if True:\n    import numpy", "numpy at once"),
@@ -291,7 +297,7 @@ def loaded(modules: str) -> set[str]:
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver
-        ("designer.proof.certificate", "cvxpy clarabel scipy agent.filter zenoh mcap matplotlib"),
+        ("designer.proof.certificate", "cvxpy clarabel scipy.optimize agent.filter zenoh mcap matplotlib"),
     ],
 )  # fmt: skip
 def test_a_process_loads_only_what_it_needs(modules: str, never: str) -> None:

@@ -36,16 +36,19 @@ class Certificate(Model):
     """What is proved: sup_k E ||z_tilde(k)||^2 <= gamma^2 sum_k ||w(k)||^2, from zero initial error.
 
     The expectation is over modes, losses and deliveries; one run may exceed it. P is over the reduced error state
-    eta = [x; e_1; ...; e_n], nodes in file order, or e alone where the errors do not depend on x.
+    eta = [x; e_1; ...; e_n], nodes in file order, or e alone where the errors do not depend on x. Kind "lyapunov" is
+    Theorem 1, (17) and (18) for P. Kind "exact" is the recursion of the exact gain, which P ends by (17); it may have
+    Theorem 1's gamma for the same P beside its own.
     """
 
-    gamma: Number = Field(gt=1e-150, lt=1e150)  # so that gamma^2 is a float64
+    gamma: Number = Field(gt=1e-150, lt=1e150)  # so that gamma^2 is a float64; the least that is proved
     kind: Literal["lyapunov", "exact"]
-    form: Literal["structured", "full"]
+    theorem1_gamma: Number | None = Field(default=None, gt=1e-150, lt=1e150)  # kind "exact": proved too, by (18)
+    form: Literal["structured", "full", "summed"]  # summed: P is not stored; who verifies sums it from the gains
     R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx); None with e alone
     Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]
     P: dict[str, Matrix] | None = None  # full: P[mode]
-    horizon: int | None = Field(default=None, strict=True)  # of the exact gain
+    horizon: int | None = Field(default=None, strict=True)  # kind "exact": the proof needs no more steps than this
     lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
     lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
@@ -53,6 +56,20 @@ class Certificate(Model):
     holds: bool = Field(strict=True)
     verified: str  # what was verified, and how
     margins: dict[str, Number]  # by how much each inequality holds; all positive where it does
+
+    @property
+    def by_theorem1(self) -> float | None:
+        """The gamma that (17) and (18) prove, for a P that is stored."""
+        return self.gamma if self.kind == "lyapunov" else self.theorem1_gamma
+
+    @model_validator(mode="after")
+    def _check_claims(self) -> Self:
+        if self.theorem1_gamma is not None and (self.kind != "exact" or self.form == "summed"):
+            raise ValueError(
+                'theorem1_gamma stands beside the gamma of kind "exact", for a P that is stored; kind '
+                f'"{self.kind}" with form "{self.form}" has none'
+            )
+        return self
 
 
 class Gains(Model):

@@ -104,6 +104,7 @@ def design_and_save(
         "problem": problem.name,
         "method": gains.method,
         "gamma": proved.gamma,
+        "theorem1_gamma": proved.theorem1_gamma,
         "lmi_gamma": proved.lmi_gamma,
         "exact": proved.exact,
         "floor": proved.floor,

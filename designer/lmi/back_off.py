@@ -6,7 +6,7 @@ tau W/2 more in eta; the cross terms that P0 brings are outweighed if
 tau <= t / (2 lambda_max(B'P0_bar B + 2 C'W^-1 C)), C = A'P0_bar B, where B'P0_bar B and C stand for the corners of
 `Operator.joint`. So (17) becomes strict, and gamma grows by about t/2 of itself.
 
-Candidates are screened by Cholesky in floats; the first that passes is proved in ball arithmetic, or the next is tried.
+Candidates are screened by Cholesky in floats; the first that passes is proved, or the next is tried.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel, error_model, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.theorem1 import check
+from designer.proof.prover import Prover
 
 Form = Literal["structured", "full"]
 
@@ -59,7 +59,7 @@ def _prove(
     problem: Problem, K: LinkMatrices, H: LinkMatrices, model: ErrorModel, P: Array, form: Form, t: float
 ) -> Confirmed:
     gamma = least_gamma(model.M, P) * _ABOVE
-    return Confirmed(P, form, t, check(problem, K, H, P=P, gamma=gamma))
+    return Confirmed(P, form, t, Prover(problem, K, H, P=P).theorem1(gamma))
 
 
 def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Form, float, Array]]:

@@ -15,7 +15,7 @@ from designer.lmi.back_off import Confirmed, back_off, least_gamma, satisfies_17
 from designer.lmi.inwards import inwards
 from designer.lmi.recovery import block_diagonal, links, unconfirmed
 from designer.model.error_model import error_model, stacked_links
-from designer.proof.theorem1 import check
+from designer.proof.prover import Prover
 
 
 class Designed(NamedTuple):
@@ -94,7 +94,7 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
         if not satisfies_17(model, P):
             continue
         gamma = least_gamma(model.M, P) * (1.0 + 1e-9 + t / 100.0)  # so that (18) is strict
-        verdict = check(problem, K, H, P=P, gamma=gamma)
+        verdict = Prover(problem, K, H, P=P).theorem1(gamma)
         if verdict.holds:
             return Designed(K, H, Confirmed(P, "structured", t, verdict))
     return None

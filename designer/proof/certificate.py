@@ -1,11 +1,12 @@
 """The certificate proved again, without a solver: mean-square stability, and gamma, for the numbers of the gains file.
 
-Every inequality is proved for the exact matrices that the file's floats stand for, in ball arithmetic
-(designer.proof.balls). Kind "lyapunov" is Theorem 1 (designer.proof.theorem1), kind "exact" the recursion of the exact
-gain (designer.proof.recursion).
+Every inequality is proved for the exact matrices that the file's floats stand for (designer.proof.prover). Kind
+"lyapunov" is Theorem 1, kind "exact" the recursion of the exact gain, with Theorem 1 beside it where the file has it.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,28 +15,34 @@ from agent.contract.errors import InputError, listed
 from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.proof.findings import Verdict
-from designer.proof.recursion import check_exact
-from designer.proof.theorem1 import check
-
-MOST_STEPS = 1_000_000  # of a recursion that is proved; designs need fewer even where errors hardly decay
+from designer.proof.prover import BALLS, FLOATS, Make, Prover
+from designer.proof.recursion import MOST_STEPS
 
 
-def verify(gains: Gains) -> Verdict:
-    """Prove what the gains file claims, from everything as it stands in it. InputError: there is none to be read."""
-    proved, P = gains.certificate, lyapunov_matrix(gains)
-    if proved.kind == "lyapunov":
-        return check(gains.problem, gains.K, gains.H, P=P, gamma=proved.gamma)
-    if proved.horizon is None or proved.horizon < 1:
-        raise InputError(f'certificate: horizon is {proved.horizon}; kind "exact" needs the number of its steps')
-    if proved.horizon > MOST_STEPS:
-        raise InputError(f"certificate: horizon is {proved.horizon}; a proof takes at most {MOST_STEPS} steps")
-    return check_exact(gains.problem, gains.K, gains.H, P=P, gamma=proved.gamma, horizon=proved.horizon)
+def verify(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Verdict:
+    """Prove all that the gains file claims, from everything as it stands in it. InputError: there is none to be read.
+
+    `makes`: in which arithmetic.
+    """
+    claim, most, prover = gains.certificate, gains.certificate.horizon, prover_of(gains, makes=makes)
+    if most is not None and not 1 <= most <= MOST_STEPS:
+        raise InputError(f"certificate: horizon is {most}; a proof takes from 1 to {MOST_STEPS} steps")
+    if claim.kind == "lyapunov":
+        return prover.theorem1(claim.gamma)
+    verdict = prover.exact(claim.gamma, most=MOST_STEPS if most is None else most)
+    return verdict if claim.theorem1_gamma is None else verdict.joined(prover.theorem1(claim.theorem1_gamma))
+
+
+def prover_of(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Prover:
+    """For the gains as they are, and the P of their certificate; or its own where that stores none."""
+    _refuse_other_matrices(gains.problem, gains.certificate)
+    P = None if gains.certificate.form == "summed" else lyapunov_matrix(gains)
+    return Prover(gains.problem, gains.K, gains.H, P=P, makes=makes)
 
 
 def lyapunov_matrix(gains: Gains) -> Array:
-    """P(s) over eta = [x; e_1; ...; e_n], or over e alone, from the stored certificate, (modes, n_eta, n_eta)."""
+    """P(s) over eta = [x; e_1; ...; e_n], or over e alone, as the certificate stores it, (modes, n_eta, n_eta)."""
     problem, certificate = gains.problem, gains.certificate
-    _refuse_other_matrices(problem, certificate)
     nx, p = problem.nx, problem.plant_states
     n_eta = p + problem.n * nx
     P = np.zeros((len(problem.mode_names), n_eta, n_eta))
@@ -53,14 +60,13 @@ def lyapunov_matrix(gains: Gains) -> Array:
 
 def _refuse_other_matrices(problem: Problem, certificate: Certificate) -> None:
     """A matrix that the proof would not use is refused: whoever wrote it meant something by it."""
-    modes, nodes, needed = problem.mode_names, problem.node_names, {"P"}
-    if certificate.form == "structured":
-        needed = {"R", "Q"} if problem.carries_plant else {"Q"}
+    modes, nodes = problem.mode_names, problem.node_names
+    structured = ["Q", "R"] if problem.carries_plant else ["Q"]
+    needed = {"structured": structured, "full": ["P"], "summed": []}[certificate.form]
     for letter, matrices in (("R", certificate.R), ("Q", certificate.Q), ("P", certificate.P)):
         if matrices is not None and letter not in needed:
-            raise InputError(
-                f'certificate: form "{certificate.form}" has {listed(sorted(needed))} for these errors, and no {letter}'
-            )
+            has = listed(needed) or "nothing stored"
+            raise InputError(f'certificate: form "{certificate.form}" has {has} for these errors, and no {letter}')
     parts = [("P", "mode", certificate.P, modes), ("Q", "mode", certificate.Q, modes)]
     parts += [(f"Q of mode {mode}", "node", of_mode, nodes) for mode, of_mode in (certificate.Q or {}).items()]
     for what, kind, matrices, names in parts:

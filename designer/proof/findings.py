@@ -1,26 +1,30 @@
-"""What a proof found: every inequality with its sign, and the verdict on all of them, with as many bits as it takes."""
+"""What a proof found: every inequality with its sign, and the verdict on all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
-
-import flint
-from flint import ctx
 
 from designer.proof.balls import Sign
 
-BITS = (128, 256, 512, 1024)  # carried one after the other, until every inequality is proved or one proved false
-
 
 class Verdict(NamedTuple):
-    """Whether the certificate is proved; where it is not, the inequality that fails, and by how much."""
+    """Whether what is claimed is proved; where it is not, the inequality that fails, and by how much."""
 
     holds: bool
     gamma: float
     arithmetic: str
     failure: str | None
     margins: dict[str, float]  # of each inequality and mode: the least eigenvalue after scaling; not proved: <= 0
+
+    def joined(self, other: Verdict) -> Verdict:
+        """Both, with this one's gamma."""
+        arithmetic = "; ".join(dict.fromkeys([self.arithmetic, other.arithmetic]))
+        return self._replace(
+            holds=self.holds and other.holds,
+            arithmetic=arithmetic,
+            failure=self.failure or other.failure,
+            margins=self.margins | other.margins,
+        )
 
 
 class Finding(NamedTuple):
@@ -36,27 +40,35 @@ class Finding(NamedTuple):
         return f"{self.inequality} mode {self.mode}"
 
 
-def decided(findings: Callable[[], list[Finding]], gamma: float) -> Verdict:
-    """The verdict on all findings, with as many bits as it takes; what is proved false is named first."""
-    for bits in BITS:
-        with ctx.workprec(bits):
-            found = findings()
-        failed = [finding for finding in found if not finding.sign.proved]
-        false = [finding for finding in failed if finding.sign.refuted]
-        if false or not failed:
-            break
-    margins: dict[str, float] = {}
-    for finding in found:
-        least = finding.sign.least if finding.sign.proved else min(finding.sign.least, 0.0)
-        margins[finding.name] = min(least, margins.get(finding.name, least))
-    failure = _text((false or failed)[0], bits) if failed else None
-    return Verdict(
-        failure is None, gamma, f"ball arithmetic of {bits} bits (flint {flint.__version__})", failure, margins
-    )
+def found(inequality: str, modes: tuple[str, ...], signs: list[Sign], at: str = "") -> list[Finding]:
+    """A finding for each mode."""
+    return [Finding(inequality, mode, sign, at) for mode, sign in zip(modes, signs, strict=True)]
 
 
-def _text(failed: Finding, bits: int) -> str:
-    where, least = f'{failed.inequality} fails in mode "{failed.mode}"{failed.at}', f"{failed.sign.least:.3g}"
-    if failed.sign.refuted:
+def proved(findings: list[Finding]) -> bool:
+    return all(finding.sign.proved for finding in findings)
+
+
+def refuted(findings: list[Finding]) -> bool:
+    return any(finding.sign.refuted for finding in findings)
+
+
+def margins(findings: list[Finding]) -> dict[str, float]:
+    """The least of every inequality and mode."""
+    least: dict[str, float] = {}
+    for finding in findings:
+        margin = finding.sign.least if finding.sign.proved else min(finding.sign.least, 0.0)
+        least[finding.name] = min(margin, least.get(finding.name, margin))
+    return least
+
+
+def failure(findings: list[Finding], arithmetic: str) -> str | None:
+    """What is wrong in one sentence, what is proved false first; None where all is proved."""
+    failed = [finding for finding in findings if not finding.sign.proved]
+    if not failed:
+        return None
+    first = next((finding for finding in failed if finding.sign.refuted), failed[0])
+    where, least = f'{first.inequality} fails in mode "{first.mode}"{first.at}', f"{first.sign.least:.3g}"
+    if first.sign.refuted:
         return f"{where}: it is false, its least scaled eigenvalue is {least} and must be positive"
-    return f"{where}: it is not proved, its least scaled eigenvalue is about {least}, which {bits} bits leave open"
+    return f"{where}: it is not proved, its least scaled eigenvalue is about {least}, which {arithmetic} leaves open"

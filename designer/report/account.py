@@ -163,14 +163,16 @@ def single_run_gamma(gains: Gains) -> float | None:
     inequality of Ville gives `Chance`. A certificate of kind "exact" proves a smaller gamma by other means, which says
     nothing of single runs; its P is taken all the same. None where there is no such P.
     """
-    from designer.proof.certificate import lyapunov_matrix  # it loads ball arithmetic
-    from designer.proof.theorem1 import check
+    from designer.proof.certificate import prover_of  # it loads ball arithmetic
 
-    if gains.certificate.kind == "lyapunov":
-        return gains.certificate.gamma
+    if gains.certificate.by_theorem1 is not None:
+        return gains.certificate.by_theorem1
     p = gains.problem.plant_states
     try:
-        P = lyapunov_matrix(gains)
+        prover = prover_of(gains)
+        P = prover.P
+        if P is None:
+            return None
         M = np.zeros((gains.problem.n * gains.problem.nz, P.shape[1]))
         M[:, p:] = np.kron(np.eye(gains.problem.n), gains.problem.plant.M)
         square = max(np.linalg.eigvalsh(M @ np.linalg.solve((P_s + P_s.T) / 2.0, M.T))[-1] for P_s in P)
@@ -179,7 +181,7 @@ def single_run_gamma(gains: Gains) -> float | None:
     if not 0.0 < square < np.inf:
         return None
     gamma = float(np.sqrt(square) * (1.0 + _ROUNDED))
-    return gamma if check(gains.problem, gains.K, gains.H, P=P, gamma=gamma).holds else None
+    return gamma if prover.theorem1(gamma).holds else None
 
 
 def over_nodes(statistic: Callable[..., Array], values: Array) -> Array:

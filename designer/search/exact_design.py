@@ -12,13 +12,13 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, exact_gain
+from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.recursion import check_exact
+from designer.proof.prover import BALLS, FLOATS, Prover
 from designer.search.descent import Descent, Progress, descend
 from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
 
@@ -110,12 +110,12 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
 def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
     """gamma just above the exact gain of any gains of (5), proved; or Unattainable."""
     gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
-    if gain.P is None:
+    if not gain.stable:
         raise Unattainable(
             f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
             "in each step, and less than 1 is needed"
         )
-    verdict = _confirmed(problem, K, H, gain, gain.P)
+    verdict = confirmed(problem, K, H, gain.high)
     if not verdict.holds:
         raise Unattainable(
             f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
@@ -124,13 +124,11 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
     return Certificate(
         gamma=verdict.gamma,
         kind="exact",
-        form="full",
-        P=dict(zip(problem.mode_names, gain.P, strict=True)),
-        horizon=gain.horizon,
+        form="summed",
         exact=(gain.low, gain.high),
         floor=floor(problem),
         holds=verdict.holds,
-        verified=f"(17) for P, the recursion of the exact gain over the horizon and its tail: {verdict.arithmetic}",
+        verified=f"(17) for a P summed from the gains, and the recursion of the exact gain: {verdict.arithmetic}",
         margins=verdict.margins,
     )
 
@@ -145,12 +143,17 @@ def _advice(problem: Problem) -> str:
     )
 
 
-def _confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, P: Array) -> Verdict:
-    for factor in _ABOVE:
-        gamma = gain.high * factor
-        verdict = check_exact(problem, K, H, P=P, gamma=gamma, horizon=gain.horizon)
-        if verdict.holds:
-            break
+def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *, P: Array | None = None) -> Verdict:
+    """The least gamma just above the exact gain that is proved, by floats if they can; else the last that was tried.
+
+    P satisfies (17); without one it is summed from the gains.
+    """
+    for makes in (FLOATS, FLOATS + BALLS):
+        prover = Prover(problem, K, H, P=P, makes=makes)
+        for factor in _ABOVE:
+            verdict = prover.exact(high * factor)
+            if verdict.holds:
+                return verdict
     return verdict
 
 

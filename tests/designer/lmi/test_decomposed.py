@@ -27,7 +27,7 @@ from designer.model.error_model import error_model, link_gains
 from designer.model.units import natural_units
 from designer.problems import find
 from designer.proof.certificate import verify
-from designer.proof.theorem1 import check
+from designer.proof.prover import Prover
 from designer.synthesis import design
 
 PAPER = [
@@ -303,19 +303,20 @@ def test_cliques_hold_every_group_and_form_a_tree(seed: int) -> None:
 
 @networks
 def test_designs_are_confirmed_with_a_small_certificate(problem: Problem) -> None:
-    """The check holds, P is diag{R, Q(s)}, gamma is near the optimum, also after a round trip through the file.
+    """The check holds, P is diag{R, Q(s)}, its gamma is near the optimum, also after a round trip through the file.
 
-    The exact gain is below; R is left out where the errors do not depend on x.
+    The exact gain is below, and proved too; R is left out where the errors do not depend on x.
     """
     gains = design(problem, method="decomposed")
     proved = gains.certificate
     assert proved.form == "structured"
     assert proved.lmi_gamma is not None
-    assert proved.lmi_gamma * (1.0 - 1e-5) <= proved.gamma <= proved.lmi_gamma * (1.0 + 1e-4)
+    assert proved.by_theorem1 is not None
+    assert proved.lmi_gamma * (1.0 - 1e-5) <= proved.by_theorem1 <= proved.lmi_gamma * (1.0 + 1e-4)
     assert verify(Gains.from_bytes(gains.canonical(), source="memory")).holds
     assert (proved.R is None) is not problem.carries_plant
     assert proved.exact is not None
-    assert proved.exact[0] <= proved.gamma
+    assert proved.gamma == pytest.approx(min(proved.exact[1], proved.by_theorem1), rel=1e-9)
     assert gains.solver.residuals is not None
     assert max(gains.solver.residuals) < 1e-6
 
@@ -334,7 +335,7 @@ def test_the_idle_network_is_strictly_inside(problem: Problem) -> None:
     np.testing.assert_allclose(K_bar[0], np.kron(np.eye(problem.n), problem.plant.A), atol=1e-12)
     P = block_diagonal(idle.R, idle.Q)
     gamma = 1.01 * least_gamma(error_model(problem, K_bar, H_bar).M, P)
-    verdict = check(problem, *link_gains(problem, K_bar, H_bar), P=P, gamma=gamma)
+    verdict = Prover(problem, *link_gains(problem, K_bar, H_bar), P=P).theorem1(gamma)
     assert verdict.holds
     assert min(verdict.margins.values()) > 1e-3
 
@@ -478,7 +479,7 @@ def test_twenty_five_nodes_are_designed_in_seconds_and_stored_small() -> None:
     """4 modes: confirmed within 1e-4 of the optimum, in a gains file of less than 200 kB."""
     gains = design(banded(25), method="decomposed")
     assert gains.certificate.form == "structured"
-    assert gains.certificate.gamma == pytest.approx(gains.certificate.lmi_gamma, rel=1e-4)
+    assert gains.certificate.by_theorem1 == pytest.approx(gains.certificate.lmi_gamma, rel=1e-4)
     assert len(gains.canonical()) < 200_000
     assert gains.solver.status == "optimal"
     assert gains.solver.version == clarabel.__version__

@@ -14,8 +14,7 @@ from agent.contract import schedule
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from designer.problems import find
-from designer.proof.certificate import lyapunov_matrix
-from designer.proof.theorem1 import check
+from designer.proof.certificate import prover_of
 from designer.report.account import Account, Chance, over_nodes, single_run_gamma
 from designer.synthesis import design
 
@@ -117,19 +116,20 @@ def exact() -> Gains:
 
 
 def test_of_an_exact_certificate_it_is_the_least_gamma_that_its_matrix_proves(exact: Gains) -> None:
-    """It is not below the exact gain, which says nothing of single runs; a thousandth less is proved false."""
-    gamma, P = single_run_gamma(exact), lyapunov_matrix(exact)
+    """It is not below the exact gain, which says nothing of single runs; of a thousandth less (18) is not proved."""
+    gamma, prover = single_run_gamma(exact), prover_of(exact)
     assert gamma is not None
     assert exact.certificate.exact is not None
     assert gamma >= exact.certificate.exact[0]
-    assert check(exact.problem, exact.K, exact.H, P=P, gamma=gamma).holds
-    refuted = check(exact.problem, exact.K, exact.H, P=P, gamma=0.999 * gamma)
-    assert refuted.failure is not None
-    assert "(18) fails" in refuted.failure
+    assert prover.theorem1(gamma).holds
+    less = prover.theorem1(0.999 * gamma)
+    assert less.failure is not None
+    assert "(18) fails" in less.failure
 
 
 def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: Gains) -> None:
-    assert exact.certificate.P is not None
-    turned = exact.certificate.model_copy(update={"P": {mode: -P for mode, P in exact.certificate.P.items()}})
+    P = prover_of(exact).P
+    assert P is not None
+    turned = exact.certificate.model_copy(update={"form": "full", "P": {"linked": -P[0]}})
     assert single_run_gamma(exact.model_copy(update={"certificate": turned})) is None
     assert account_of(tmp_path).chance is None

@@ -1,0 +1,133 @@
+"""What can be proved of gains, without a solver: Theorem 1's bound for a P, and the exact gain.
+
+Floats with bounds are asked first. What they leave open is asked of balls, with more bits each time, where the network
+is small enough for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import NamedTuple
+
+from agent.contract.arrays import Array
+from agent.contract.gains import LinkMatrices
+from agent.contract.problem import Problem
+from designer.proof.by_balls import ByBalls
+from designer.proof.by_floats import ByFloats
+from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
+from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, recursion
+
+Make = Callable[[Problem, LinkMatrices, LinkMatrices], Arithmetic]
+
+FLOATS: tuple[Make, ...] = (ByFloats,)
+BALLS: tuple[Make, ...] = tuple(partial(ByBalls, bits=bits) for bits in (128, 256, 512, 1024))
+
+# The largest order of eta for which balls are asked what floats leave open: some minutes at 128 bits.
+_LARGEST_RECURSION = 130
+_LARGEST_INEQUALITY = 450
+_STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
+
+
+class _Answer(NamedTuple):
+    findings: list[Finding]
+    arithmetic: str
+
+
+class Prover:
+    """P (modes, n_eta, n_eta), of which (P + P')/2 counts; without one, it is found here. `makes`: whom to ask."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        *,
+        P: Array | None = None,
+        makes: Sequence[Make] = FLOATS + BALLS,
+    ) -> None:
+        self._problem, self._K, self._H, self._given, self._makes = problem, K, H, P, makes
+        self._made: list[Arithmetic] = []
+
+    @cached_property
+    def P(self) -> Array | None:
+        """What satisfies (17), as far as is known before it is proved; None where floats find none."""
+        return ByFloats(self._problem, self._K, self._H).model.lyapunov() if self._given is None else self._given
+
+    def theorem1(self, gamma: float) -> Verdict:
+        """(17) and (18) in every mode."""
+        if self.P is None:
+            return self._no_P(gamma)
+        P, modes = self.P, self._problem.mode_names
+        last = self._ask(lambda by: found("(18)", modes, by.inequality_18(P, gamma)), largest=_LARGEST_INEQUALITY)
+        return _verdict(gamma, [self._inequality_17, self._of_P(last)])
+
+    def exact(self, gamma: float, *, most: int = MOST_STEPS) -> Verdict:
+        """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
+        if self.P is None:
+            return self._no_P(gamma)
+        P, modes, answers = self.P, self._problem.mode_names, self._stability
+        if all(proved(answer.findings) for answer in answers):
+            last = self._ask(lambda by: recursion(by, modes, gamma, P, most=most), largest=_LARGEST_RECURSION)
+            return _verdict(gamma, [*answers, last])
+        if any(refuted(answer.findings) for answer in answers):
+            return _verdict(gamma, answers)
+        return _verdict(gamma, [*self._disproof(gamma), *answers])
+
+    @cached_property
+    def _inequality_17(self) -> _Answer:
+        P, modes = self.P, self._problem.mode_names
+        assert P is not None
+        answer = self._ask(lambda by: found("(17)", modes, by.inequality_17(P)), largest=_LARGEST_INEQUALITY)
+        return self._of_P(answer)
+
+    @cached_property
+    def _stability(self) -> list[_Answer]:
+        P, modes = self.P, self._problem.mode_names
+        assert P is not None
+        positive = self._ask(lambda by: found("P > 0", modes, by.positive(P)), largest=_LARGEST_INEQUALITY)
+        return [self._inequality_17, self._of_P(positive)]
+
+    def _of_P(self, answer: _Answer) -> _Answer:
+        """That a P which nobody claims is none says nothing of the claim."""
+        if self._given is not None:
+            return answer
+        findings = [finding._replace(sign=finding.sign._replace(refuted=False)) for finding in answer.findings]
+        return answer._replace(findings=findings)
+
+    def _ask(self, question: Callable[[Arithmetic], list[Finding]], *, largest: int) -> _Answer:
+        """The first answer that decides; else the last."""
+        for k in range(len(self._makes)):
+            by = self._arithmetic(k)
+            answer = _Answer(question(by), by.name)
+            if proved(answer.findings) or refuted(answer.findings):
+                break
+            if by.order > largest and k + 1 < len(self._makes):
+                more = f"(ball arithmetic, which sees further, is asked up to {largest} states of the errors)"
+                return answer._replace(arithmetic=f"{by.name} {more}")
+        return answer
+
+    def _arithmetic(self, k: int) -> Arithmetic:
+        while len(self._made) <= k:
+            self._made.append(self._makes[len(self._made)](self._problem, self._K, self._H))
+        return self._made[k]
+
+    def _disproof(self, gamma: float) -> list[_Answer]:
+        by = self._arithmetic(0)
+        false = disproof(by, self._problem.mode_names, gamma, most=_STEPS_OF_DISPROOF)
+        return [] if false is None else [_Answer([false], by.name)]
+
+    def _no_P(self, gamma: float) -> Verdict:
+        answers = self._disproof(gamma)
+        if answers:
+            return _verdict(gamma, answers)
+        why = "no P for (17) was found: as far as floats tell, the errors are not mean-square stable"
+        return Verdict(False, gamma, self._arithmetic(0).name, why, {})
+
+
+def _verdict(gamma: float, answers: Sequence[_Answer]) -> Verdict:
+    findings = [finding for answer in answers for finding in answer.findings]
+    false_first = sorted(answers, key=lambda answer: not refuted(answer.findings))
+    why = next((text for answer in false_first if (text := failure(answer.findings, answer.arithmetic))), None)
+    arithmetic = "; ".join(dict.fromkeys(answer.arithmetic for answer in answers))
+    return Verdict(why is None, gamma, arithmetic, why, margins(findings))
