@@ -30,6 +30,9 @@ from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Sampl
 from designer import analysis, problems
 from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
 from designer.replay.central import Central
+from designer.replay.coupling import Coupling
+from designer.replay.inputs import draw, logged_inputs
+from designer.replay.proofs import to_be_heard
 from designer.report.account import Account
 
 BASES = {Frozen, Model, messages.Message}  # of which there are no instances
@@ -99,6 +102,21 @@ def examples() -> dict[type, Frozen]:
         messages.Estimate(step=1, x_hat=[0.1], innovation=[0.2], z_hat=[0.3], mode="1", heard=["2"]),
         messages.Event(step=0, kind="start", who="coordinator", detail=""),
         messages.Evidence(step=0, who="plant", first=0, digests="0123abcd--------", head="0" * 32),
+        messages.Account(
+            step=1,
+            who="node-1",
+            steps=2,
+            pairs=3,
+            pairs_substituted=0,
+            measurements_substituted=1,
+            late=0,
+            to_estimate_median=0.001,
+            to_estimate_p99=0.002,
+            to_estimate_max=0.003,
+            to_step_median=0.001,
+            to_step_p99=0.002,
+            to_step_max=0.003,
+        ),
         messages.BrokenOff(reason="the disk is full", steps=3, stop=True),
         messages.Ready(who="node-1", session="a", gains="b"),
         messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
@@ -310,7 +328,11 @@ def caching_examples() -> dict[type, Any]:
     gains = observer_gains(real_problem(1, radius=1.02))
     bar, model = stacks(gains.problem), error_model(gains.problem, *stacked_gains(gains))
     account = Account.of(GOLDEN / "zhu2020-lossy.mcap")
-    return {ErrorModel: model, Stacks: bar, Central: Central.of(gains), Account: account}
+    log, central = account.log, Central.of(account.log.gains)
+    drawn = draw(log, central)
+    hears = to_be_heard(log, central, drawn)
+    coupling = Coupling.of(log, central, logged_inputs(log, central, drawn), drawn, hears)
+    return {ErrorModel: model, Stacks: bar, Central: central, Account: account, Coupling: coupling}
 
 
 def test_what_dataclasses_cache_does_not_outlive_a_change_of_fields() -> None:
