@@ -152,7 +152,7 @@ def test_frozen_recorder_slows_the_run(lone_path: Path, tmp_path: Path) -> None:
         threading.Timer(2.0, thaw, [recorder]).start()
 
     recording = tmp_path / "run.mcap"
-    run_here(lone_path, recording, at=10, do=freeze_for_two_seconds, steps=400, window=8)
+    run_here(lone_path, recording, at=10, do=freeze_for_two_seconds, steps=2000, window=8)
     times = [message.log_time for message in logged(recording)]
     assert max(later - earlier for earlier, later in pairwise(times)) > 1.5e9  # it did stand still
     assert replay(recording).exit_code == 0
