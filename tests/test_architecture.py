@@ -52,7 +52,8 @@ ROOMS = {
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
     "designer.simulation": "designer.model designer.workers",
-    "designer.replay": "agent.contract.recording designer.model designer.proof",
+    "designer.ledger": "designer.gain designer.model designer.proof",
+    "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",

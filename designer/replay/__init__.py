@@ -33,6 +33,7 @@ from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
 from designer.replay.pacing import Pacing
 from designer.replay.part import Part
+from designer.replay.promise import promise
 from designer.replay.proofs import Check
 from designer.replay.trace import Trace
 from designer.replay.verdict import Divergence, Peak, Proof, Verdict, kind_of
@@ -248,7 +249,7 @@ def _peak(log: Log) -> Peak | None:
 
 
 def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
-    end, audit = log.end or {}, compared.audit
+    end, audit, gamma = log.end or {}, compared.audit, checked_gamma(log.gains)
     return Verdict(
         recording=log.label,
         part=tally.part,
@@ -282,7 +283,8 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         evidence=log.evidence,
         peak=_peak(log),
         energy=compared.energy,
-        gamma=checked_gamma(log.gains),
+        gamma=gamma,
+        ledger=promise(log, gamma),
         pacing=compared.pacing,
         path_margin=audit.margin if audit and audit.step >= 0 else None,
     )

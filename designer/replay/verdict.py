@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from agent.contract.arrays import ulps
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
 from agent.contract.recording.evidence.examiner import Findings
+from designer.ledger.account import Account
 from designer.replay.census import Faults
 from designer.replay.gamma import Gamma
 from designer.replay.part import Part
@@ -150,6 +151,7 @@ class Verdict:
     energy: float | None  # sum of |w|^2
     gamma: Gamma
     pacing: Pacing | None  # of a paced run
+    ledger: Account | None  # what gamma says of this run; None where it is not proved
     path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound that is not trivial; bound: proof 5 and its rounding
 
     @property
@@ -229,6 +231,7 @@ class Verdict:
             "gamma": self.gamma.value,
             "certificate": self.gamma.failure is None,
             "certificate_failure": self.gamma.failure,
+            "ledger": self.ledger.document() if self.ledger else None,
             "path_margin": self.path_margin,
             "proofs": [vars(proof) for proof in self.proofs],
         }
@@ -326,7 +329,7 @@ class Verdict:
             bound = "" if self.energy is None or not self.gamma.is_claimed else self._bound(self.energy)
             against = " against the simulated plant" if self.external else ""
             lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}")
-        return [*lines, self.gamma.text()]
+        return [*lines, self.gamma.text(), *([self.ledger.text()] if self.ledger else [])]
 
     def _bound(self, energy: float) -> str:
         return f", gamma sqrt(energy) {self.gamma.value * energy**0.5:.4g} with gamma {self.gamma.value:.5g}"

@@ -1,0 +1,122 @@
+"""A whole run gone through with the ledger: what the bound says at its end, and where it said least."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.contract.arrays import Array
+from agent.contract.errors import counted
+from agent.contract.gains import Gains
+from designer.ledger.exact import SHARE, Ledger, Promise
+from designer.ledger.happening import Happening
+
+Flags = NDArray[np.bool_]
+_LOOKS = 24  # gains that are searched along a run with faults; a search takes up to a tenth of a second
+_AS_IT_WAS = "the initial error, which is not known"
+
+
+class Account(NamedTuple):
+    """The promise at the last step, and at the worst of the steps that were looked at."""
+
+    last: Promise
+    steps: int  # of the run
+    faulty: int  # steps with something that is not as designed
+    worst: Promise | None  # None: nothing was faulty
+    worst_step: int
+    looked: int  # steps that were looked at
+
+    def text(self) -> str:
+        """In one line, for people."""
+        if self.last.status == "void" or not self.faulty:
+            return f"ledger       {self.last.text()}"
+        line = f"ledger       {self.last.text()} at the end; {counted(self.faulty, 'step')} with faults"
+        if self.worst is None or self.worst.factor <= 1.0 + SHARE:
+            return line
+        return f"{line}; at step {self.worst_step}, the worst of {self.looked} looked at, {self.worst.factor:.4g} times gamma"
+
+    def document(self) -> dict[str, Any]:
+        """For --json."""
+        last = self.last
+        return {
+            "status": last.status,
+            "factor": last.factor if math.isfinite(last.factor) else None,
+            "within": last.within,
+            "owed": [owed._asdict() for owed in last.owed],
+            "reason": last.reason,
+            "step": last.step,
+            "faulty": self.faulty,
+            "worst_factor": self.worst.factor if self.worst and math.isfinite(self.worst.factor) else None,
+            "worst_step": self.worst_step if self.worst else None,
+            "looked": self.looked,
+        }
+
+
+def happenings(substituted: Flags, unmeasured: Flags, absent: Flags, origin: Array) -> dict[int, Happening]:
+    """The steps that were not as designed, from arrays.
+
+    `substituted` (steps, n, n), row i for what node i did not use though neither mode nor model left it out;
+    `unmeasured` and `absent` (steps, n); `origin` (steps, n) is -1 where a node goes on, else the node whose estimate
+    it begins with, or n or more where it begins with 0.
+    """
+    n = unmeasured.shape[1]
+    marked = substituted.any(axis=(1, 2)) | unmeasured.any(axis=1) | absent.any(axis=1) | (origin != -1).any(axis=1)
+    found = {}
+    for k in np.flatnonzero(marked).tolist():
+        pairs = ((int(i), int(j)) for i, j in np.argwhere(substituted[k]) if i != j)
+        begun = ((int(i), int(origin[k, i])) for i in np.flatnonzero(origin[k] != -1))
+        found[k] = Happening(
+            substituted=frozenset(pairs),
+            unmeasured=frozenset(np.flatnonzero(unmeasured[k]).tolist()),
+            absent=frozenset(np.flatnonzero(absent[k]).tolist()),
+            begun=frozenset((i, j if 0 <= j < n else None) for i, j in begun),
+        )
+    return found
+
+
+def account(
+    gains: Gains,
+    *,
+    steps: int,
+    faults: Mapping[int, Happening],
+    void: tuple[str, int] | None = None,
+    starts_anywhere: bool = False,
+) -> Account:
+    """Go through a run of so many steps.
+
+    `faults` maps steps to what happened in them; `void` is the first thing that the model cannot describe, and when;
+    `starts_anywhere`: x(0) was not that of the estimates, as with a real plant.
+    """
+    if void is not None:
+        promise = Promise("void", gains.certificate.gamma, math.inf, None, (), *void)
+        return Account(promise, steps, len(faults), None, 0, 0)
+    if not faults and not starts_anywhere:
+        return Account(Promise("valid", gains.certificate.gamma, 1.0, 0, (), "", None), steps, 0, None, 0, 0)
+    ledger, looks = Ledger.of(gains), _looks(faults, steps)
+    if starts_anywhere:
+        size, modes = ledger.models.designed.size, len(gains.problem.mode_names)
+        start = np.zeros((modes, size, size))
+        start[gains.problem.mode_index(gains.problem.markov.initial)] = np.eye(size)
+        ledger.jump(start, _AS_IT_WAS, is_unit=True)
+    worst, worst_step = None, 0
+    for k in range(steps):
+        if k in faults:
+            ledger.tell(faults[k])
+        if k in looks:
+            promise = ledger.promise()
+            if worst is None or promise.factor > worst.factor:
+                worst, worst_step = promise, k
+        if k < steps - 1:
+            ledger.step()
+    return Account(ledger.promise(), steps, len(faults), worst, worst_step, len(looks))
+
+
+def _looks(faults: Mapping[int, Happening], steps: int) -> set[int]:
+    """Steps to look at: where nodes begin again, and right after a stretch of faults; the last ones of too many."""
+    begun = {k for k, happening in faults.items() if happening.begun}
+    after = {k + 1 for k in faults if k + 1 not in faults and k + 1 < steps}
+    return set(sorted(begun | after)[-_LOOKS:])

@@ -1,0 +1,301 @@
+"""The exact account: the gain of the operators that really acted, and what jumps m have left.
+
+    (E|z_tilde(k)|^2)^(1/2) <= gain(k) (E sum over j < k of |w(j)|^2)^(1/2) + sum over m of (E|z_tilde_m(k)|^2)^(1/2)
+
+docs/theory.md, section 11. Faults are taken as they were: the means are over modes, losses and deliveries of the model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+from agent.contract.gains import Gains
+from agent.contract.problem import Problem
+from designer.gain.exact import InvariantSet, Operator
+from designer.gain.exact import step as backwards
+from designer.ledger.happening import AS_DESIGNED, Acting, Happening, Models, Unabsorbed
+from designer.model.error_model import stacked_gains
+
+SHARE = 0.01  # a term below this share no longer counts
+VOID_ABOVE = 1e3  # times gamma: a bound that says nothing
+_WIDTH = 1e-4  # relative width of a gain that is searched
+_MEMORY = 256  # steps that are kept one by one
+_MOST_STEPS = 5000  # of the recursion as designed, and of a forecast
+_FORGOTTEN = 1e-9  # of what a jump was
+
+
+class Owed(NamedTuple):
+    """What a jump has left."""
+
+    what: str
+    size: float  # (E|z_tilde_m(k)|^2)^(1/2); where `is_unit`, for a jump of length 1
+    is_unit: bool
+    within: int | None  # steps as designed until it is below SHARE of what it was at most
+
+
+class Promise(NamedTuple):
+    """What the bound says at one step. `factor` times gamma is the gain to z_tilde now."""
+
+    status: str  # "valid", "valid plus" a term, or "void"
+    gamma: float
+    factor: float
+    within: int | None  # steps as designed until `factor` is below 1 + SHARE, for good; 0 where it is
+    owed: tuple[Owed, ...]
+    reason: str  # why it is void
+    step: int | None  # since when
+
+    def text(self) -> str:
+        """In one line, for people."""
+        if self.status == "void":
+            return f"void since step {self.step}: {self.reason}"
+        terms = []
+        if self.factor > 1.0 + SHARE:
+            when = "" if self.within is None else f", below {SHARE:.0%} after {self.within} steps as designed"
+            terms.append(f"{self.factor - 1.0:.1%} of gamma for faults{when}")
+        for owed in self.owed:
+            unit = f" times its length, for {owed.what}" if owed.is_unit else f" for {owed.what}"
+            when = "" if owed.within is None else f", below {SHARE:.0%} of its most after {owed.within} steps"
+            terms.append(f"{owed.size:.3g}{unit}{when}")
+        return f"valid plus {'; plus '.join(terms)}" if terms else "valid"
+
+
+@dataclass
+class _Debt:
+    what: str
+    is_unit: bool
+    X: Array  # (modes, n_eta, n_eta): E[eta_m eta_m'; r(k) = s]
+    most: float  # the largest that its size has been
+
+
+class Ledger:
+    """Stands at a step k, from 0; is told what happens in it and of jumps; steps; and says what the bound says.
+
+    `gamma` bounds the gain of these gains as designed, and P (modes, n_eta, n_eta) satisfies (17).
+    """
+
+    def __init__(self, problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float, P: Array) -> None:
+        self.models, self.gamma, self.k = Models(problem, K_bar, H_bar), gamma, 0
+        self._g, self._set = gamma**2 * (1.0 + 1e-9), InvariantSet(P)  # a rounding above: to hold at it is to be valid
+        self._root_inverse = np.linalg.inv(np.linalg.cholesky(P))
+        self._now = AS_DESIGNED
+        self._past: list[Acting | None] = []  # the last step first, down to the first that had a fault; None: designed
+        self._before = 1.0  # E eta'P eta <= this times the energy, where `_past` begins; 1 as designed
+        self._debts: list[_Debt] = []
+        self._void: tuple[str, int] | None = None
+
+    @classmethod
+    def of(cls, gains: Gains) -> Ledger:
+        """For what the certificate of a gains file claims."""
+        from designer.proof.certificate import lyapunov_matrix  # loads ball arithmetic
+
+        P = lyapunov_matrix(gains)
+        return cls(gains.problem, *stacked_gains(gains), gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
+
+    # what it is told
+    def tell(self, happening: Happening) -> None:
+        """What happens in this step, from its first moment on. What no model describes makes the bound void."""
+        try:
+            self.models.acting(happening)
+        except Unabsorbed as why:
+            self.void(str(why))
+            return
+        self._now = happening
+
+    def jump(self, covariance: Array, what: str, *, is_unit: bool = False) -> None:
+        """eta moves now: by what has this second moment, by mode (modes, n_eta, n_eta), or at most that.
+
+        For a delta that is known, delta delta' in the mode of this step. `is_unit`: the length of it is not known,
+        and `covariance` is for length 1.
+        """
+        self._debts.append(_Debt(what, is_unit, covariance, self._size(covariance)))
+
+    def void(self, reason: str) -> None:
+        """From now on nothing is promised."""
+        if self._void is None:
+            self._void = (reason, self.k)
+
+    def step(self) -> None:
+        """The step goes by."""
+        acting = None if self._now.is_as_designed else self.models.acting(self._now)
+        for debt in self._debts:
+            debt.X = self._carried(debt.X, acting)
+        self._past.insert(0, acting)
+        self.k, self._now = self.k + 1, AS_DESIGNED
+        while self._past and self._before == 1.0 and self._past[-1] is None:
+            self._past.pop()  # as designed, and before every fault: as if for ever
+        if len(self._past) > _MEMORY:
+            self._before = self._grown(self._past.pop(), self._before)
+        for debt in self._debts:
+            debt.most = max(debt.most, self._size(debt.X))
+        self._debts = [debt for debt in self._debts if self._size(debt.X) > _FORGOTTEN * debt.most]
+
+    # what it says
+    def gain(self) -> float:
+        """The least gain to z_tilde now that the recursion proves, gamma at least."""
+        return math.sqrt(self._least()) if self._is_marked else self.gamma
+
+    def owed(self) -> float:
+        """The sum of what jumps of known size have left."""
+        return sum(self._size(debt.X) for debt in self._debts if not debt.is_unit)
+
+    def bound(self, energy: float) -> float:
+        """Of (E|z_tilde(k)|^2)^(1/2), where E sum over j < k of |w(j)|^2 is `energy` or less; inf where void."""
+        return math.inf if self._void else self.gain() * math.sqrt(energy) + self.owed()
+
+    def promise(self) -> Promise:
+        """All of it."""
+        reason, since = self._void or ("", None)
+        if self._void is not None:
+            return Promise("void", self.gamma, math.inf, None, (), reason, since)
+        factor = self.gain() / self.gamma
+        if factor > VOID_ABOVE:
+            reason = f"after these faults the gain is more than {VOID_ABOVE:g} times gamma"
+            return Promise("void", self.gamma, factor, self._within(), (), reason, self.k)
+        owed = tuple(
+            Owed(debt.what, self._size(debt.X), debt.is_unit, self._fades(debt))
+            for debt in self._debts
+            if self._size(debt.X) > SHARE * debt.most
+        )
+        within = self._within() if factor > 1.0 + SHARE else 0
+        status = "valid plus" if owed or factor > 1.0 + SHARE else "valid"
+        return Promise(status, self.gamma, factor, within, owed, "", None)
+
+    @property
+    def _is_marked(self) -> bool:
+        """Whether something is not as designed, so that a search is due."""
+        return bool(self._past) or not self._now.is_as_designed
+
+    # the recursion backwards
+    def _least(self) -> float:
+        low = high = self._g
+        if self._holds(low):
+            self._forget()
+            return self.gamma**2
+        while not self._holds(high):
+            low, high = high, high * 2.0
+            if high > 4.0 * VOID_ABOVE**2 * self._g:
+                return math.inf
+        while high > low * (1.0 + _WIDTH):
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self._holds(middle) else (middle, high)
+        return high
+
+    def _holds(self, g: float, later: int = 0) -> bool:
+        """Whether E|z_tilde(k)|^2 <= g times the energy, or that of `later` steps as designed after this one."""
+        now = self.models.acting(self._now)
+        if not later:
+            return self._ends(now.before(now.MM), g, self._past)
+        Y = self._back(self.models.designed.MM, g, [None] * (later - 1) + [now])
+        return Y is not None and self._ends(Y, g, self._past)
+
+    def _ends(self, Y: Array | None, g: float, past: list[Acting | None]) -> bool:
+        """Whether the recursion from Y comes through `past` to where it holds for ever."""
+        Y = self._back(Y, g, past)
+        if Y is None:
+            return False
+        if self._before > 1.0:
+            return self._set.contains(Y, g / self._before)
+        for _ in range(_MOST_STEPS):
+            if self._set.contains(Y, g):
+                return True
+            taken = backwards(self.models.designed, Y, g)
+            if taken is None:
+                return False
+            Y = taken.Y
+        return False
+
+    def _back(self, Y: Array | None, g: float, past: list[Acting | None]) -> Array | None:
+        for acting in past:
+            taken = None if Y is None else backwards(acting.operator if acting else self.models.designed, Y, g)
+            Y = None if taken is None else acting.before(taken.Y) if acting else taken.Y
+        return Y
+
+    def _for_good(self, g: float, later: int = 0) -> bool:
+        """Whether g holds at every later step too, if all goes as designed.
+
+        Once Y <= c P in the steps as designed since the last fault, it is in all further ones, since c P is invariant
+        for c <= g; and if the recursion comes from c P through the faults, it does from any such Y.
+        """
+        if self._now.is_as_designed:
+            last = next((m for m, acting in enumerate(self._past) if acting is not None), 0)
+            since, rest = [None] * later + self._past[:last], self._past[last:]
+        elif later:
+            since, rest = [None] * (later - 1), [self.models.acting(self._now), *self._past]
+        else:
+            return False
+        Y = self._back(self.models.designed.MM, g, since)
+        if Y is None:
+            return False
+        c = self._against_P(Y)
+        return c <= g and self._ends(c * self._set.P, g, rest)
+
+    def _forget(self) -> None:
+        """The faults, once they cannot matter again."""
+        if self._now.is_as_designed and self._past and self._past[0] is None and self._for_good(self._g):
+            self._past, self._before = [], 1.0
+
+    def _within(self) -> int | None:
+        """The first of the steps to come from which on the gain is below (1 + SHARE) gamma."""
+        g, first = self._g * (1.0 + SHARE) ** 2, 0
+        for later in range(_MOST_STEPS):
+            if self._for_good(g, later):
+                return first
+            if not self._holds(g, later):
+                first = later + 1
+        return None
+
+    # what P says where steps are no longer kept one by one
+    def _against_P(self, Y: Array) -> float:
+        """The least c with Y <= c P in every mode."""
+        return _largest(self._root_inverse @ Y @ self._root_inverse.swapaxes(1, 2))
+
+    def _grown(self, acting: Acting | None, before: float) -> float:
+        """The least c with E eta'P eta <= c times the energy after a step, where that held with `before`."""
+        operator: Operator = acting.operator if acting else self.models.designed
+        if acting is not None and acting.J is not None:
+            before *= max(1.0, self._against_P(acting.before(self._set.P)))
+        S, n = operator.joint(operator.bar(self._set.P)), operator.size
+        S[:, :n] = self._root_inverse @ S[:, :n]
+        S[:, :, :n] = S[:, :, :n] @ self._root_inverse.swapaxes(1, 2)
+        scale = np.concatenate([np.full(n, math.sqrt(before)), np.ones(operator.nw)])
+        return max(1.0, _largest(S * scale[:, None] * scale))
+
+    # jumps
+    def _size(self, X: Array) -> float:
+        now = self.models.acting(self._now)
+        return math.sqrt(max(float(np.einsum("sij,sij->", now.before(now.MM), X)), 0.0))
+
+    def _carried(self, X: Array, acting: Acting | None) -> Array:
+        operator = acting.operator if acting else self.models.designed
+        n = operator.size
+        joint = np.zeros((len(X), n + operator.nw, n + operator.nw))
+        joint[:, :n, :n] = acting.after(X) if acting else X
+        return operator.carry(joint)
+
+    def _fades(self, debt: _Debt) -> int | None:
+        """Steps as designed until the debt is below SHARE of its most, for good as far as it was followed."""
+        first = None
+        for later, size in enumerate(self._sizes(debt.X)):
+            if size > SHARE * debt.most:
+                first = None
+            elif first is None:
+                first = later
+            if size < 0.1 * SHARE * debt.most:
+                return first
+        return None
+
+    def _sizes(self, X: Array) -> Iterator[float]:
+        MM = self.models.designed.MM
+        for later in range(_MOST_STEPS):
+            yield math.sqrt(max(float(np.einsum("sij,sij->", MM, X)), 0.0))
+            X = self._carried(X, None if later else self.models.acting(self._now))
+
+
+def _largest(Y: Array) -> float:
+    return float(np.linalg.eigvalsh((Y + Y.swapaxes(1, 2)) / 2.0).max())
