@@ -18,6 +18,7 @@ from designer.commands import (
     compare,
     design,
     export,
+    identify,
     recordings,
     recover,
     report,
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     recover.add_recover(commands)
     compare.add_compare(commands)
     export.add_export(commands)
+    identify.add_identify(commands)
     simulate.add_simulate(commands)
     report.add_report(commands)
     reproduce.add_reproduce(commands)

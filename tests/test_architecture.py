@@ -54,14 +54,15 @@ ROOMS = {
     "designer.simulation": "designer.model designer.workers",
     "designer.ledger": "designer.gain designer.model designer.proof",
     "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
+    "designer.identify": "designer.gain designer.model designer.replay",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.show": "agent.contract.recording",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
-    "designer.diagnosis designer.export designer.gain designer.ladder designer.problems designer.proof "
-    "designer.replay designer.report designer.reproduce designer.search designer.show designer.simulation "
-    "designer.synthesis designer.what_if",
+    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
+    "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
+    "designer.simulation designer.synthesis designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
@@ -80,6 +81,7 @@ DOORS = {
         "designer/gain/exact.py",
         "designer/proof/float_model.py",
         "designer/proof/machine.py",
+        "designer/identify/fit.py",
         "designer/export/matlab.py",
     ],
     "pyarrow": ["designer/export/tables.py"],

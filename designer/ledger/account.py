@@ -37,7 +37,8 @@ class Account(NamedTuple):
         line = f"ledger       {self.last.text()} at the end; {counted(self.faulty, 'step')} with faults"
         if self.worst is None or self.worst.factor <= 1.0 + SHARE:
             return line
-        return f"{line}; at step {self.worst_step}, the worst of {self.looked} looked at, {self.worst.factor:.4g} times gamma"
+        worst = f"{self.worst.factor:.4g} times gamma"
+        return f"{line}; at step {self.worst_step}, the worst of {self.looked} looked at, {worst}"
 
     def document(self) -> dict[str, Any]:
         """For --json."""
