@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.errors import counted
 from agent.contract.gains import Gains
-from designer.ledger.exact import SHARE, Ledger, Promise
-from designer.ledger.happening import Happening
+from designer.ledger.deviation import Deviation
+from designer.ledger.exact import Ledger
+from designer.ledger.promise import SHARE, Promise
 
 Flags = NDArray[np.bool_]
 _LOOKS = 24  # gains that are searched along a run with faults; a search takes up to a tenth of a second
@@ -30,11 +31,16 @@ class Account(NamedTuple):
     worst_step: int
     looked: int  # steps that were looked at
 
+    @property
+    def is_plain(self) -> bool:
+        """From the first step to the last, the bound said what it says of any run."""
+        return self.last.status == "valid" and not self.faulty
+
     def text(self) -> str:
         """In one line, for people."""
         if self.last.status == "void" or not self.faulty:
-            return f"ledger       {self.last.text()}"
-        line = f"ledger       {self.last.text()} at the end; {counted(self.faulty, 'step')} with faults"
+            return self.last.text()
+        line = f"{self.last.text()} at the end; {counted(self.faulty, 'step')} with faults"
         if self.worst is None or self.worst.factor <= 1.0 + SHARE:
             return line
         worst = f"{self.worst.factor:.4g} times gamma"
@@ -57,7 +63,7 @@ class Account(NamedTuple):
         }
 
 
-def happenings(substituted: Flags, unmeasured: Flags, absent: Flags, origin: Array) -> dict[int, Happening]:
+def deviations(substituted: Flags, unmeasured: Flags, absent: Flags, origin: Array) -> dict[int, Deviation]:
     """The steps that were not as designed, from arrays.
 
     `substituted` (steps, n, n), row i for what node i did not use though neither mode nor model left it out;
@@ -70,7 +76,7 @@ def happenings(substituted: Flags, unmeasured: Flags, absent: Flags, origin: Arr
     for k in np.flatnonzero(marked).tolist():
         pairs = ((int(i), int(j)) for i, j in np.argwhere(substituted[k]) if i != j)
         begun = ((int(i), int(origin[k, i])) for i in np.flatnonzero(origin[k] != -1))
-        found[k] = Happening(
+        found[k] = Deviation(
             substituted=frozenset(pairs),
             unmeasured=frozenset(np.flatnonzero(unmeasured[k]).tolist()),
             absent=frozenset(np.flatnonzero(absent[k]).tolist()),
@@ -83,7 +89,7 @@ def account(
     gains: Gains,
     *,
     steps: int,
-    faults: Mapping[int, Happening],
+    faults: Mapping[int, Deviation],
     void: tuple[str, int] | None = None,
     starts_anywhere: bool = False,
 ) -> Account:
@@ -116,8 +122,8 @@ def account(
     return Account(ledger.promise(), steps, len(faults), worst, worst_step, len(looks))
 
 
-def _looks(faults: Mapping[int, Happening], steps: int) -> set[int]:
+def _looks(faults: Mapping[int, Deviation], steps: int) -> set[int]:
     """Steps to look at: where nodes begin again, and right after a stretch of faults; the last ones of too many."""
-    begun = {k for k, happening in faults.items() if happening.begun}
+    begun = {k for k, deviation in faults.items() if deviation.begun}
     after = {k + 1 for k in faults if k + 1 not in faults and k + 1 < steps}
     return set(sorted(begun | after)[-_LOOKS:])

@@ -12,7 +12,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.ledger.happening import AS_DESIGNED, Acting, Happening, Models
+from designer.ledger.deviation import AS_DESIGNED, Acting, Deviation, Models
 
 
 class Rates(NamedTuple):
@@ -30,15 +30,15 @@ class Cheap:
         self.v = 0.0
         self._models, self._P = Models(problem, K_bar, H_bar), P
         self._root_inverse = np.linalg.inv(np.linalg.cholesky(P))
-        self._rates: dict[Happening, Rates] = {}
+        self._rates: dict[Deviation, Rates] = {}
         self._now = AS_DESIGNED
 
-    def tell(self, happening: Happening) -> None:
+    def tell(self, deviation: Deviation) -> None:
         """What happens in this step. Raises Unabsorbed where no error model describes it."""
-        acting = self._models.acting(happening)
+        acting = self._models.acting(deviation)
         if acting.J is not None:
             self.v *= self._against_P(acting.before(self._P))
-        self._now = happening
+        self._now = deviation
 
     def jump(self, size: float) -> None:
         """eta moves by delta: `size` bounds E delta'P delta."""
@@ -54,11 +54,11 @@ class Cheap:
         """Of (E|z_tilde|^2)^(1/2), over the nodes that are there."""
         return math.sqrt(max(self._against_P(self._models.acting(self._now).MM), 0.0) * self.v)
 
-    def rates(self, happening: Happening) -> Rates:
+    def rates(self, deviation: Deviation) -> Rates:
         """The three numbers of what acts in the step, once nodes have begun."""
-        if happening not in self._rates:
-            self._rates[happening] = self._found(self._models.acting(happening))
-        return self._rates[happening]
+        if deviation not in self._rates:
+            self._rates[deviation] = self._found(self._models.acting(deviation))
+        return self._rates[deviation]
 
     def _found(self, acting: Acting) -> Rates:
         operator, n = acting.operator, acting.operator.size

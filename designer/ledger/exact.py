@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,50 +18,14 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.gain.exact import InvariantSet, Operator
 from designer.gain.exact import step as backwards
-from designer.ledger.happening import AS_DESIGNED, Acting, Happening, Models, Unabsorbed
+from designer.ledger.deviation import AS_DESIGNED, Acting, Deviation, Models, Unabsorbed
+from designer.ledger.promise import SHARE, VOID_ABOVE, Owed, Promise
 from designer.model.error_model import stacked_gains
 
-SHARE = 0.01  # a term below this share no longer counts
-VOID_ABOVE = 1e3  # times gamma: a bound that says nothing
 _WIDTH = 1e-4  # relative width of a gain that is searched
 _MEMORY = 256  # steps that are kept one by one
 _MOST_STEPS = 5000  # of the recursion as designed, and of a forecast
 _FORGOTTEN = 1e-9  # of what a jump was
-
-
-class Owed(NamedTuple):
-    """What a jump has left."""
-
-    what: str
-    size: float  # (E|z_tilde_m(k)|^2)^(1/2); where `is_unit`, for a jump of length 1
-    is_unit: bool
-    within: int | None  # steps as designed until it is below SHARE of what it was at most
-
-
-class Promise(NamedTuple):
-    """What the bound says at one step. `factor` times gamma is the gain to z_tilde now."""
-
-    status: str  # "valid", "valid plus" a term, or "void"
-    gamma: float
-    factor: float
-    within: int | None  # steps as designed until `factor` is below 1 + SHARE, for good; 0 where it is
-    owed: tuple[Owed, ...]
-    reason: str  # why it is void
-    step: int | None  # since when
-
-    def text(self) -> str:
-        """In one line, for people."""
-        if self.status == "void":
-            return f"void since step {self.step}: {self.reason}"
-        terms = []
-        if self.factor > 1.0 + SHARE:
-            when = "" if self.within is None else f", below {SHARE:.0%} after {self.within} steps as designed"
-            terms.append(f"{self.factor - 1.0:.1%} of gamma for faults{when}")
-        for owed in self.owed:
-            unit = f" times its length, for {owed.what}" if owed.is_unit else f" for {owed.what}"
-            when = "" if owed.within is None else f", below {SHARE:.0%} of its most after {owed.within} steps"
-            terms.append(f"{owed.size:.3g}{unit}{when}")
-        return f"valid plus {'; plus '.join(terms)}" if terms else "valid"
 
 
 @dataclass
@@ -98,14 +61,14 @@ class Ledger:
         return cls(gains.problem, *stacked_gains(gains), gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
 
     # what it is told
-    def tell(self, happening: Happening) -> None:
+    def tell(self, deviation: Deviation) -> None:
         """What happens in this step, from its first moment on. What no model describes makes the bound void."""
         try:
-            self.models.acting(happening)
+            self.models.acting(deviation)
         except Unabsorbed as why:
             self.void(str(why))
             return
-        self._now = happening
+        self._now = deviation
 
     def jump(self, covariance: Array, what: str, *, is_unit: bool = False) -> None:
         """eta moves now: by what has this second moment, by mode (modes, n_eta, n_eta), or at most that.

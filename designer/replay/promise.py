@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from designer.ledger.account import Account, account
-from designer.ledger.happening import Happening
+from designer.ledger.deviation import Deviation
 from designer.replay.gamma import Gamma
 from designer.replay.log import Log
 
-_NOTHING: Mapping[int, Happening] = {}
+_NOTHING: Mapping[int, Deviation] = {}
 
 
-def promise(log: Log, gamma: Gamma, faults: Mapping[int, Happening] = _NOTHING) -> Account | None:
+def promise(log: Log, gamma: Gamma, faults: Mapping[int, Deviation] = _NOTHING) -> Account | None:
     """The account of the steps that are there; None where no gamma is proved. `faults` by step."""
     if not gamma.is_claimed or gamma.failure is not None or not log.steps:
         return None

@@ -329,7 +329,7 @@ class Verdict:
             bound = "" if self.energy is None or not self.gamma.is_claimed else self._bound(self.energy)
             against = " against the simulated plant" if self.external else ""
             lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}")
-        return [*lines, self.gamma.text(), *([self.ledger.text()] if self.ledger else [])]
+        return [*lines, self.gamma.text(), *([f"ledger       {self.ledger.text()}"] if self.ledger else [])]
 
     def _bound(self, energy: float) -> str:
         return f", gamma sqrt(energy) {self.gamma.value * energy**0.5:.4g} with gamma {self.gamma.value:.5g}"

@@ -86,6 +86,8 @@ def _faults(account: Account) -> Iterator[str]:
             yield f"{word}: {counted(faults.total, 'message')}; first {first}."
     for fault in (*verdict.strange, *verdict.numbering, *verdict.evidence.wrong)[:NAMED]:
         yield f"{fault}."
+    if verdict.ledger and not verdict.ledger.is_plain:
+        yield f"What γ says of this run: {verdict.ledger.text()}."
     for note in verdict.notes:
         yield f"Note: {note}."
     if verdict.external:

@@ -16,10 +16,11 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.exact import step as backwards
-from designer.ledger.account import account, happenings
+from designer.ledger.account import account, deviations
 from designer.ledger.cheap import Cheap
-from designer.ledger.exact import SHARE, Ledger
-from designer.ledger.happening import AS_DESIGNED, Happening, Models, Unabsorbed
+from designer.ledger.deviation import AS_DESIGNED, Deviation, Models, Unabsorbed
+from designer.ledger.exact import Ledger
+from designer.ledger.promise import SHARE
 from designer.model.error_model import error_model, measurement_slices, stacked_gains
 
 GOLDEN = Gains.load(ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json")
@@ -34,13 +35,13 @@ def ledger() -> Ledger:
     return Ledger(PROBLEM, K_BAR, H_BAR, gamma=GAIN.high, P=GAIN.P)
 
 
-def silent(j: int) -> Happening:
+def silent(j: int) -> Deviation:
     """Nobody gets the messages of node j, which goes on."""
-    return Happening(substituted=frozenset((i, j) for i in range(PROBLEM.n) if i != j))
+    return Deviation(substituted=frozenset((i, j) for i in range(PROBLEM.n) if i != j))
 
 
-def away(j: int) -> Happening:
-    return Happening(absent=frozenset({j}))
+def away(j: int) -> Deviation:
+    return Deviation(absent=frozenset({j}))
 
 
 # runs, node by node from (1)-(5)
@@ -52,7 +53,7 @@ class Runs(NamedTuple):
     energy: Array  # of sum over j < k of |w(j)|^2
 
 
-def simulate(faults: Sequence[Happening], policy: Callable[[int, Array, Array], Array], *, mode: int, delta: Array,
+def simulate(faults: Sequence[Deviation], policy: Callable[[int, Array, Array], Array], *, mode: int, delta: Array,
              at: int) -> Runs:  # fmt: skip
     """Runs from r(0) = mode; w(k) = policy(k, modes, eta); x_hat moves by -delta at step `at`, (n, nx)."""
     rng, p, n, nx = np.random.default_rng(8), PROBLEM, PROBLEM.n, PROBLEM.nx
@@ -95,12 +96,12 @@ def simulate(faults: Sequence[Happening], policy: Callable[[int, Array, Array], 
 class Worst(NamedTuple):
     """A disturbance that is nearly worst for z_tilde after all of `faults`."""
 
-    faults: list[Happening]  # from its first step on
+    faults: list[Deviation]  # from its first step on
     mode: int
     policy: Callable[[int, Array, Array], Array]
 
 
-def worst_for(faults: Sequence[Happening], end: Happening, gain: float) -> Worst:
+def worst_for(faults: Sequence[Deviation], end: Deviation, gain: float) -> Worst:
     """w = Gamma eta of the recursion just above `gain`, from the step and mode where the least W is; end is now."""
     models, Gamma, least = Models(PROBLEM, K_BAR, H_BAR), [], []
     now = models.acting(end)
@@ -127,10 +128,10 @@ def worst_for(faults: Sequence[Happening], end: Happening, gain: float) -> Worst
 SCHEDULES = {
     "silent": ([silent(0)] * 5, AS_DESIGNED),
     "silent, and two steps later": ([silent(3)] * 6 + [AS_DESIGNED] * 2, AS_DESIGNED),
-    "no measurements": ([Happening(unmeasured=frozenset({0, 2, 3}))] * 6, AS_DESIGNED),
+    "no measurements": ([Deviation(unmeasured=frozenset({0, 2, 3}))] * 6, AS_DESIGNED),
     "away": ([away(3)] * 5, away(3)),
-    "away, and back with 0": ([away(0)] * 5, Happening(begun=frozenset({(0, None)}))),
-    "away, and back with a neighbour's": ([away(0)] * 5, Happening(begun=frozenset({(0, 3)}))),
+    "away, and back with 0": ([away(0)] * 5, Deviation(begun=frozenset({(0, None)}))),
+    "away, and back with a neighbour's": ([away(0)] * 5, Deviation(begun=frozenset({(0, 3)}))),
 }
 
 
@@ -154,7 +155,7 @@ def test_the_bound_holds_and_is_attained(name: str) -> None:
     assert attained > 1.02 * GAIN.high  # the mutant that forgets the faults
 
 
-def run_through(book: Ledger, faults: Sequence[Happening], end: Happening) -> None:
+def run_through(book: Ledger, faults: Sequence[Deviation], end: Deviation) -> None:
     for fault in faults:
         book.tell(fault)
         book.step()
@@ -239,7 +240,7 @@ def test_silence_for_ever_is_the_exact_gain_of_the_model_without_the_node() -> N
 def test_a_short_memory_bounds_no_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """What P says of the steps that are no longer kept one by one is above what they say themselves."""
     schedule = [silent(k % 4) if k % 7 < 2 else AS_DESIGNED for k in range(60)]
-    schedule[30] = Happening(begun=frozenset({(1, None)}))
+    schedule[30] = Deviation(begun=frozenset({(1, None)}))
     exact = ledger()
     monkeypatch.setattr("designer.ledger.exact._MEMORY", 8)
     short = ledger()
@@ -262,7 +263,7 @@ def test_the_cheap_account_is_above_the_moments() -> None:
     assert GAIN.P is not None
     cheap, models = Cheap(PROBLEM, K_BAR, H_BAR, P=GAIN.P), Models(PROBLEM, K_BAR, H_BAR)
     rng, size = np.random.default_rng(2), 2 + 8
-    schedule = [AS_DESIGNED] * 5 + [silent(0)] * 4 + [away(2)] * 3 + [Happening(begun=frozenset({(2, None)}))]
+    schedule = [AS_DESIGNED] * 5 + [silent(0)] * 4 + [away(2)] * 3 + [Deviation(begun=frozenset({(2, None)}))]
     X, mean = np.zeros((4, size, size)), np.zeros((4, size))
     chances = np.eye(4)[0]
     for k, fault in enumerate(schedule + [AS_DESIGNED] * 15):
@@ -310,14 +311,14 @@ def test_what_no_model_describes_is_void() -> None:
     gain = exact_gain(error_model(gains.problem, K, H))
     assert gain.P is not None
     book = Ledger(gains.problem, K, H, gamma=gain.high, P=gain.P)
-    book.tell(Happening(begun=frozenset({(1, 0)})))
+    book.tell(Deviation(begun=frozenset({(1, 0)})))
     book.step()
     assert book.promise().status != "void"
-    book.tell(Happening(begun=frozenset({(1, None)})))
+    book.tell(Deviation(begun=frozenset({(1, None)})))
     assert book.promise().text().startswith('void since step 1: node "n1" began with 0')
     assert book.bound(1.0) == math.inf
     with pytest.raises(Unabsorbed):
-        Models(gains.problem, K, H).acting(Happening(begun=frozenset({(1, None)})))
+        Models(gains.problem, K, H).acting(Deviation(begun=frozenset({(1, None)})))
 
 
 def test_the_first_reason_stays() -> None:
@@ -334,22 +335,22 @@ def test_an_account_of_a_run_tells_the_worst_and_the_end() -> None:
     substituted = np.zeros((40, 4, 4), dtype=bool)
     substituted[10:15, :, 0] = True
     none, goes_on = np.zeros((40, 4), dtype=bool), np.full((40, 4), -1)
-    found = account(GOLDEN, steps=40, faults=happenings(substituted, none, none, goes_on))
+    found = account(GOLDEN, steps=40, faults=deviations(substituted, none, none, goes_on))
     book = Ledger.of(GOLDEN)
     run_through(book, [silent(0)] * 5, AS_DESIGNED)
     assert found.worst is not None
     assert found.worst.factor == pytest.approx(book.gain() / book.gamma)
     assert (found.worst_step, found.faulty, found.last.status) == (15, 5, "valid")
-    assert account(GOLDEN, steps=40, faults={}).text() == "ledger       valid"
+    assert account(GOLDEN, steps=40, faults={}).text() == "valid"
 
 
-def test_arrays_become_happenings() -> None:
+def test_arrays_become_deviations() -> None:
     substituted, none = np.zeros((3, 4, 4), dtype=bool), np.zeros((3, 4), dtype=bool)
     substituted[1, 0, 3] = True
     substituted[1, 0, 0] = True  # a node is no neighbour of itself
     origin = np.full((3, 4), -1)
     origin[2] = [-1, 0, 4, -1]
-    assert happenings(substituted, none, none, origin) == {
-        1: Happening(substituted=frozenset({(0, 3)})),
-        2: Happening(begun=frozenset({(1, 0), (2, None)})),
+    assert deviations(substituted, none, none, origin) == {
+        1: Deviation(substituted=frozenset({(0, 3)})),
+        2: Deviation(begun=frozenset({(1, 0), (2, None)})),
     }

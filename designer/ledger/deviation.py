@@ -13,7 +13,7 @@ from designer.gain.exact import Operator
 from designer.model.error_model import error_model, measurement_slices
 
 
-class Happening(NamedTuple):
+class Deviation(NamedTuple):
     """Nodes by their index. What is not in it goes as designed: modes, losses and deliveries are as in the model."""
 
     substituted: frozenset[tuple[int, int]] = frozenset()  # (i, j): node i took x_hat_i for x_hat_j, and nu_j = 0
@@ -26,7 +26,7 @@ class Happening(NamedTuple):
         return self == AS_DESIGNED
 
 
-AS_DESIGNED = Happening()
+AS_DESIGNED = Deviation()
 
 
 class Acting(NamedTuple):
@@ -46,11 +46,11 @@ class Acting(NamedTuple):
 
 
 class Unabsorbed(Exception):
-    """A happening that no error model of these gains describes, and why."""
+    """A deviation that no error model of these gains describes, and why."""
 
 
 class Models:
-    """The error model of every happening of one network, made when it is first asked for.
+    """The error model of every deviation of one network, made when it is first asked for.
 
     A pair that is substituted moves K_ij to K_ii and leaves H_ij out; without a measurement H_ji is 0 for all j.
     An absent node has no gains, so that its error is that of the estimate 0, which nobody hears.
@@ -58,49 +58,49 @@ class Models:
 
     def __init__(self, problem: Problem, K_bar: Array, H_bar: Array) -> None:
         self.problem, self.K_bar, self.H_bar = problem, K_bar, H_bar
-        self._known: dict[Happening, Acting] = {}
-        self._operators: dict[Happening, Operator] = {}
+        self._known: dict[Deviation, Acting] = {}
+        self._operators: dict[Deviation, Operator] = {}
 
     @cached_property
     def designed(self) -> Operator:
         return Operator(error_model(self.problem, self.K_bar, self.H_bar))
 
-    def acting(self, happening: Happening) -> Acting:
+    def acting(self, deviation: Deviation) -> Acting:
         """What acts. Raises Unabsorbed where a node begins with 0 and the errors do not know x."""
-        if happening not in self._known:
-            self._known[happening] = Acting(self._operator(happening), self._J(happening), self._MM(happening))
-        return self._known[happening]
+        if deviation not in self._known:
+            self._known[deviation] = Acting(self._operator(deviation), self._J(deviation), self._MM(deviation))
+        return self._known[deviation]
 
-    def _operator(self, happening: Happening) -> Operator:
-        of_step = happening._replace(begun=frozenset())
+    def _operator(self, deviation: Deviation) -> Operator:
+        of_step = deviation._replace(begun=frozenset())
         if of_step.is_as_designed:
             return self.designed
         if of_step not in self._operators:
             self._operators[of_step] = Operator(error_model(self.problem, *self._gains(of_step)))
         return self._operators[of_step]
 
-    def _gains(self, happening: Happening) -> tuple[Array, Array]:
+    def _gains(self, deviation: Deviation) -> tuple[Array, Array]:
         problem, nx, rows = self.problem, self.problem.nx, measurement_slices(self.problem)
         K, H = self.K_bar.copy(), self.H_bar.copy()
         nodes = [slice(i * nx, (i + 1) * nx) for i in range(problem.n)]
-        without = {(i, j) for j in happening.absent for i in range(problem.n) if i != j}
-        for i, j in happening.substituted | without:
+        without = {(i, j) for j in deviation.absent for i in range(problem.n) if i != j}
+        for i, j in deviation.substituted | without:
             K[:, nodes[i], nodes[i]] += K[:, nodes[i], nodes[j]]
             K[:, nodes[i], nodes[j]] = 0.0
             H[:, nodes[i], rows[j]] = 0.0
-        for j in happening.unmeasured:
+        for j in deviation.unmeasured:
             H[:, :, rows[j]] = 0.0
-        for i in happening.absent:
+        for i in deviation.absent:
             K[:, nodes[i]], H[:, nodes[i]] = 0.0, 0.0
         return K, H
 
-    def _J(self, happening: Happening) -> Array | None:
+    def _J(self, deviation: Deviation) -> Array | None:
         """e_i := e_j, or x where the node begins with 0."""
-        if not happening.begun:
+        if not deviation.begun:
             return None
         problem, p, nx = self.problem, self.problem.plant_states, self.problem.nx
         J = np.eye(self.designed.size)
-        for i, j in sorted(happening.begun, key=str):
+        for i, j in sorted(deviation.begun, key=str):
             rows = slice(p + i * nx, p + (i + 1) * nx)
             J[rows] = 0.0
             if j is not None:
@@ -112,8 +112,8 @@ class Models:
                 raise Unabsorbed(f'node "{name}" began with 0, and of x itself, its error then, the bound says nothing')
         return J
 
-    def _MM(self, happening: Happening) -> Array:
+    def _MM(self, deviation: Deviation) -> Array:
         M = self.designed.M.copy()
-        for i in happening.absent:
+        for i in deviation.absent:
             M[i * self.problem.nz : (i + 1) * self.problem.nz] = 0.0
         return np.broadcast_to(M.T @ M, self.designed.MM.shape)
