@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.contract.arrays import Array
 from agent.contract.errors import counted
 from agent.contract.gains import Gains
 from designer.ledger.deviation import Deviation
@@ -63,7 +62,7 @@ class Account(NamedTuple):
         }
 
 
-def deviations(substituted: Flags, unmeasured: Flags, absent: Flags, origin: Array) -> dict[int, Deviation]:
+def deviations(substituted: Flags, unmeasured: Flags, absent: Flags, origin: NDArray[np.int64]) -> dict[int, Deviation]:
     """The steps that were not as designed, from arrays.
 
     `substituted` (steps, n, n), row i for what node i did not use though neither mode nor model left it out;
