@@ -8,8 +8,10 @@ docs/theory.md, section 11. Faults are taken as they were: the means are over mo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,9 +25,18 @@ from designer.ledger.promise import SHARE, VOID_ABOVE, Owed, Promise
 from designer.model.error_model import stacked_gains
 
 _WIDTH = 1e-4  # relative width of a gain that is searched
-_MEMORY = 256  # steps that are kept one by one
-_MOST_STEPS = 5000  # of the recursion as designed, and of a forecast
+_MEMORY = 64  # steps that are kept one by one, beside twice those that the recursion takes as designed
+_MOST_STEPS = 5000  # of the recursion as designed, and of what jumps have left
+_MOST_AHEAD = 200  # steps of a forecast of the gain
+_LOOSE = 1e3  # of `Ledger._c`: it is then sought anew
 _FORGOTTEN = 1e-9  # of what a jump was
+
+
+class _Gone(NamedTuple):
+    """A step that went by."""
+
+    acting: Acting | None  # None: as designed
+    c: float  # of `Ledger._c`, before it
 
 
 @dataclass
@@ -47,8 +58,9 @@ class Ledger:
         self._g, self._set = gamma**2 * (1.0 + 1e-9), InvariantSet(P)  # a rounding above: to hold at it is to be valid
         self._root_inverse = np.linalg.inv(np.linalg.cholesky(P))
         self._now = AS_DESIGNED
-        self._past: list[Acting | None] = []  # the last step first, down to the first that had a fault; None: designed
-        self._before = 1.0  # E eta'P eta <= this times the energy, where `_past` begins; 1 as designed
+        self._past: list[_Gone] = []  # the last step first
+        self._c = 1.0  # E eta'P eta <= c times the energy so far; 1 as designed
+        self._is_cut = False  # steps before `_past` were not all as designed
         self._debts: list[_Debt] = []
         self._void: tuple[str, int] | None = None
 
@@ -88,12 +100,15 @@ class Ledger:
         acting = None if self._now.is_as_designed else self.models.acting(self._now)
         for debt in self._debts:
             debt.X = self._carried(debt.X, acting)
-        self._past.insert(0, acting)
+        if acting is not None or self._past:
+            self._past.insert(0, _Gone(acting, self._c))
+            self._c = self._grown(acting, self._c)
         self.k, self._now = self.k + 1, AS_DESIGNED
-        while self._past and self._before == 1.0 and self._past[-1] is None:
-            self._past.pop()  # as designed, and before every fault: as if for ever
-        if len(self._past) > _MEMORY:
-            self._before = self._grown(self._past.pop(), self._before)
+        if self._c > _LOOSE:
+            self._c = self._sought()
+        if len(self._past) > self._memory:
+            self._past.pop()
+            self._is_cut = True
         for debt in self._debts:
             debt.most = max(debt.most, self._size(debt.X))
         self._debts = [debt for debt in self._debts if self._size(debt.X) > _FORGOTTEN * debt.most]
@@ -135,10 +150,19 @@ class Ledger:
         return bool(self._past) or not self._now.is_as_designed
 
     # the recursion backwards
+    @cached_property
+    def _memory(self) -> int:
+        Y, steps = self.models.designed.MM, 0
+        while steps < _MOST_STEPS and not self._set.contains(Y, self._g):
+            taken = backwards(self.models.designed, Y, self._g)
+            if taken is None:
+                break
+            Y, steps = taken.Y, steps + 1
+        return _MEMORY + 2 * steps
+
     def _least(self) -> float:
         low = high = self._g
         if self._holds(low):
-            self._forget()
             return self.gamma**2
         while not self._holds(high):
             low, high = high, high * 2.0
@@ -153,73 +177,74 @@ class Ledger:
         """Whether E|z_tilde(k)|^2 <= g times the energy, or that of `later` steps as designed after this one."""
         now = self.models.acting(self._now)
         if not later:
-            return self._ends(now.before(now.MM), g, self._past)
-        Y = self._back(self.models.designed.MM, g, [None] * (later - 1) + [now])
-        return Y is not None and self._ends(Y, g, self._past)
+            return self._ends(now.before(now.MM), g)
+        return self._ends(self._back(self.models.designed.MM, g, [None] * (later - 1) + [now]), g)
 
-    def _ends(self, Y: Array | None, g: float, past: list[Acting | None]) -> bool:
-        """Whether the recursion from Y comes through `past` to where it holds for ever."""
-        Y = self._back(Y, g, past)
-        if Y is None:
-            return False
-        if self._before > 1.0:
-            return self._set.contains(Y, g / self._before)
-        for _ in range(_MOST_STEPS):
-            if self._set.contains(Y, g):
-                return True
-            taken = backwards(self.models.designed, Y, g)
-            if taken is None:
-                return False
-            Y = taken.Y
+    def _ends(self, Y: Array | None, g: float, first: int = 0) -> bool:
+        """Whether the recursion from Y, `first` steps ago, comes to Y <= g P / c, so that all before is bounded."""
+        for m in range(first, len(self._past) + 1):
+            c = self._past[m - 1].c if m else self._c
+            if Y is None or self._set.contains(Y, g / c):
+                return Y is not None
+            if m < len(self._past):
+                Y = self._back(Y, g, [self._past[m].acting])
+        for _ in range(0 if self._is_cut else _MOST_STEPS):
+            if Y is None or self._set.contains(Y, g):
+                return Y is not None
+            Y = self._back(Y, g, [None])
         return False
 
-    def _back(self, Y: Array | None, g: float, past: list[Acting | None]) -> Array | None:
+    def _back(self, Y: Array | None, g: float, past: Sequence[Acting | None]) -> Array | None:
         for acting in past:
             taken = None if Y is None else backwards(acting.operator if acting else self.models.designed, Y, g)
             Y = None if taken is None else acting.before(taken.Y) if acting else taken.Y
         return Y
 
-    def _for_good(self, g: float, later: int = 0) -> bool:
+    def _for_good(self, g: float, later: int) -> bool:
         """Whether g holds at every later step too, if all goes as designed.
 
         Once Y <= c P in the steps as designed since the last fault, it is in all further ones, since c P is invariant
         for c <= g; and if the recursion comes from c P through the faults, it does from any such Y.
         """
         if self._now.is_as_designed:
-            last = next((m for m, acting in enumerate(self._past) if acting is not None), 0)
-            since, rest = [None] * later + self._past[:last], self._past[last:]
+            last = next((m for m, gone in enumerate(self._past) if gone.acting is not None), len(self._past))
+            Y = self._back(self.models.designed.MM, g, [None] * (later + last))
         elif later:
-            since, rest = [None] * (later - 1), [self.models.acting(self._now), *self._past]
+            last, Y = 0, self._back(self.models.designed.MM, g, [None] * (later - 1))
         else:
             return False
-        Y = self._back(self.models.designed.MM, g, since)
-        if Y is None:
+        if Y is None or (c := self._against_P(Y)) > g:
             return False
-        c = self._against_P(Y)
-        return c <= g and self._ends(c * self._set.P, g, rest)
-
-    def _forget(self) -> None:
-        """The faults, once they cannot matter again."""
-        if self._now.is_as_designed and self._past and self._past[0] is None and self._for_good(self._g):
-            self._past, self._before = [], 1.0
+        through = [] if self._now.is_as_designed else [self.models.acting(self._now)]
+        return self._ends(self._back(c * self._set.P, g, through), g, last)
 
     def _within(self) -> int | None:
         """The first of the steps to come from which on the gain is below (1 + SHARE) gamma."""
         g, first = self._g * (1.0 + SHARE) ** 2, 0
-        for later in range(_MOST_STEPS):
+        for later in range(_MOST_AHEAD):
             if self._for_good(g, later):
                 return first
             if not self._holds(g, later):
                 first = later + 1
         return None
 
-    # what P says where steps are no longer kept one by one
+    # what P says of the past
+    def _sought(self) -> float:
+        """The least c, within a fifth, with E eta'P eta <= c times the energy so far, by the recursion from P."""
+        low, high = 1.0, self._c
+        while high > 1.2 * low:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self._ends(self._set.P, middle) else (middle, high)
+        return high
+
     def _against_P(self, Y: Array) -> float:
         """The least c with Y <= c P in every mode."""
         return _largest(self._root_inverse @ Y @ self._root_inverse.swapaxes(1, 2))
 
     def _grown(self, acting: Acting | None, before: float) -> float:
         """The least c with E eta'P eta <= c times the energy after a step, where that held with `before`."""
+        if acting is None and before == 1.0:
+            return before
         operator: Operator = acting.operator if acting else self.models.designed
         if acting is not None and acting.J is not None:
             before *= max(1.0, self._against_P(acting.before(self._set.P)))
