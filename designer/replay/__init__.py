@@ -18,13 +18,14 @@ whole network. It never imports the runtime's filter.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.problem import Problem
+from designer.ledger.deviation import Deviation
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
 from designer.replay.coupling import Coupling, with_the_plant
@@ -33,7 +34,7 @@ from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
 from designer.replay.pacing import Pacing
 from designer.replay.part import Part
-from designer.replay.promise import promise
+from designer.replay.promise import faults_of, promise
 from designer.replay.proofs import Check
 from designer.replay.trace import Trace
 from designer.replay.verdict import Divergence, Peak, Proof, Verdict, kind_of
@@ -194,6 +195,7 @@ class _Compared(NamedTuple):
     audit: PathAudit | None  # proof 5, where errors can be computed
     energy: float | None  # and sum of |w|^2
     pacing: Pacing | None
+    faults: Mapping[int, Deviation]  # by step
 
 
 def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compared:
@@ -202,10 +204,11 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compa
     inputs = logged_inputs(log, central, drawn)
     hears = proofs.to_be_heard(log, central, drawn)
     coupling = pacing = None
+    faults: Mapping[int, Deviation] = {}
     if log.is_paced:
         log = with_the_plant(log, drawn)
         coupling = Coupling.of(log, central, inputs, drawn, hears)
-        pacing = Pacing.of(coupling, hears, log.period)
+        pacing, faults = Pacing.of(coupling, hears, log.period), faults_of(coupling, hears)
         central, hears = coupling.central, coupling.hears
     tally.add(proofs.start_checks(log, central))
     for first in range(0, log.steps, _STEPS_AT_ONCE):
@@ -236,8 +239,8 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compa
             if tally.trace is not None:
                 tally.trace.path_bound[path.first : path.first + len(path.bound)] = path.bound
     if not log.has_plant:
-        return _Compared(None, None, pacing)
-    return _Compared(audit, float(energies.sum()), pacing)
+        return _Compared(None, None, pacing, faults)
+    return _Compared(audit, float(energies.sum()), pacing, faults)
 
 
 def _peak(log: Log) -> Peak | None:
