@@ -18,11 +18,11 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.gain.exact import InvariantSet, Operator
+from designer.gain.exact import InvariantSet, Operator, lyapunov
 from designer.gain.exact import step as backwards
 from designer.ledger.deviation import AS_DESIGNED, Acting, Deviation, Models, Unabsorbed
 from designer.ledger.promise import SHARE, VOID_ABOVE, Owed, Promise
-from designer.model.error_model import stacked_gains
+from designer.model.error_model import error_model, stacked_gains
 
 _WIDTH = 1e-4  # relative width of a gain that is searched
 _MEMORY = 64  # steps that are kept one by one, beside twice those that the recursion takes as designed
@@ -66,11 +66,16 @@ class Ledger:
 
     @classmethod
     def of(cls, gains: Gains) -> Ledger:
-        """For what the certificate of a gains file claims."""
+        """For what the certificate of a gains file claims; where that stores no P, one is made here, in floats."""
         from designer.proof.certificate import lyapunov_matrix  # loads ball arithmetic
 
-        P = lyapunov_matrix(gains)
-        return cls(gains.problem, *stacked_gains(gains), gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
+        K_bar, H_bar = stacked_gains(gains)
+        P = None
+        if gains.certificate.form == "summed":
+            P, _ = lyapunov(Operator(error_model(gains.problem, K_bar, H_bar)))
+        if P is None:
+            P = lyapunov_matrix(gains)
+        return cls(gains.problem, K_bar, H_bar, gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
 
     # what it is told
     def tell(self, deviation: Deviation) -> None:

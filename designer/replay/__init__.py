@@ -287,7 +287,7 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         peak=_peak(log),
         energy=compared.energy,
         gamma=gamma,
-        ledger=promise(log, gamma),
+        ledger=promise(log, gamma, compared.faults),
         pacing=compared.pacing,
         path_margin=audit.margin if audit and audit.step >= 0 else None,
     )

@@ -308,6 +308,16 @@ def test_the_cheap_account_is_above_the_moments() -> None:
     assert all(cheap.rates(AS_DESIGNED)[2:])
 
 
+def test_a_certificate_without_a_stored_P_has_a_ledger_too() -> None:
+    changes = {"form": "summed", "P": None, "R": None, "Q": None, "kind": "exact", "gamma": GAIN.high, "horizon": 100}
+    other = GOLDEN.model_copy(update={"certificate": GOLDEN.certificate.model_copy(update=changes)})
+    book = Ledger.of(other)
+    run_through(book, [silent(0)] * 5, AS_DESIGNED)
+    same = ledger()
+    run_through(same, [silent(0)] * 5, AS_DESIGNED)
+    assert book.gain() == pytest.approx(same.gain(), rel=2e-4)
+
+
 # what is void
 def unbiased() -> Gains:
     """Of a network whose errors do not know x."""
