@@ -23,6 +23,7 @@ from agent.contract import keys, messages, schedule
 from agent.contract.gains import Certificate, Gains, Solver
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
+from agent.contract.recording.evidence.chains import Chains
 from agent.contract.recording.writer import RecordingWriter
 from agent.roles.plant import SimulatedPlant
 
@@ -114,13 +115,18 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
     x_hat, mode, sent = (
         {name: np.zeros(problem.nx) for name in problem.node_names},
         "",
-        dict.fromkeys([keys.COORDINATOR, keys.PLANT, *problem.node_names], 0),
+        dict.fromkeys([keys.COORDINATOR, keys.PLANT, *map(keys.node_who, problem.node_names)], 0),
     )
+    chains = Chains()
     with RecordingWriter(path, run=run, gains=gains) as writer:
 
         def put(topic: str, who: str, message: messages.Message) -> None:
-            time = (message.step + 1) * 1_000_000
-            writer.add(Logged(topic, message.encode(), sent[who], time, time))
+            time, payload = (message.step + 1) * 1_000_000, message.encode()
+            writer.add(Logged(topic, payload, sent[who], time, time))
+            stamp = messages.Stamp(sent[who], time, who, messages.digest_of(topic, payload))
+            evidence = chains.add(stamp, message.step)
+            if evidence is not None:
+                writer.add(Logged(keys.EVIDENCE, evidence.encode(), 0, time, time))
             sent[who] += 1
 
         for k in range(steps):
@@ -138,12 +144,14 @@ def write(path: Path, gains: Gains, *, steps: int, seed: int) -> None:
                     mode=mode,
                     heard=hears[name][mode] if k else [],
                 )
-                put(keys.estimate(name), name, estimate)
+                put(keys.estimate(name), keys.node_who(name), estimate)
             put(keys.PLANT_STATE, keys.PLANT, state)
             index = next(chain)
             mode = problem.mode_names[index]
             put(keys.MODE, keys.COORDINATOR, messages.Mode(step=k, mode=mode, index=index))
             x_hat = {name: node.step(part, mode, pairs) for name, part in slices.items()}
+        for evidence in chains.rest(last=True):
+            writer.add(Logged(keys.EVIDENCE, evidence.encode(), 0, steps * 1_000_000, steps * 1_000_000))
         writer.finish({"status": "finished", "reason": "", "steps": str(steps)})
 
 
@@ -168,7 +176,7 @@ def main() -> None:
         path.with_name(path.name + ".new").unlink()
     best = {name: min((run[name] for run in runs), key=lambda facts: facts["seconds"]) for name in PROGRAMS}
     assert best["replay"]["good"]
-    assert len({facts["messages"] for facts in best.values()}) == 1
+    assert best["replay"]["messages"] == best["show"]["messages"]
     print(f"{options.nodes} nodes, {options.steps} steps, {best['show']['messages']} messages, {size / 1e6:.1f} MB")
     for name, facts in best.items():
         print(

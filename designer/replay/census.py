@@ -19,7 +19,8 @@ Of a file that is cut, damaged or of a run that did not finish, everything is la
 than it shows anything. Either is named.
 
 Numbers that a tool has rewritten say nothing, and are told apart from numbers with a fault by how many there are. In a
-part too few may be left to tell, so faults of theirs are noted there, and held against nobody.
+part too few may be left to tell, so faults of theirs are noted there, and held against nobody; and so is a number that
+cannot be right where no checksum covers it.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ class Facts:
 
     steps: int  # that are to be there
     is_finished: bool  # the run came to its end, and the file is sound
+    is_checked: bool  # a checksum covers every message
     has_start: bool  # the coordinator's first event is there
     has_end: bool  # and its last
     events: Numbers  # their numbers
@@ -122,8 +124,9 @@ def take_census(
     is_part |= numbering.is_part
     lacks = np.ones_like(lacks) if is_part else lacks & ~_contradicted(holes, topics, facts)
     is_part |= bool(lacks.any())
-    unseen = numbering.unseen if facts.is_finished else ()
+    unseen = () if is_part else numbering.unseen
     lacking, missing = _within(holes.where(lacks), topics, part), _within(holes.where(~lacks), topics, part)
+    counts = not is_part and (facts.is_checked or numbering.is_exchanged)
     events = numbering.events if is_part or not facts.is_finished else 0
     copies = sum(topic.copies for topic in topics) + facts.event_copies
     words = "stands in it again with the same content, and counts" if copies == 1 else "stand in it again, and count"
@@ -137,8 +140,8 @@ def take_census(
         duplicates=Faults(len(double), tuple(sorted(double, key=_by_step)[:NAMED])),
         copies=copies,
         strange=tuple(strange),
-        numbering=() if is_part else (*numbering.faults, *unseen),
-        notes=(*numbering.notes, *(numbering.faults if is_part else ()), *again),
+        numbering=(*(numbering.faults if counts else ()), *unseen),
+        notes=(*numbering.notes, *(() if counts else numbering.faults), *again),
     )
 
 

@@ -147,7 +147,7 @@ def _log(
     census = take_census(
         topics.values(),
         columns,
-        content.facts(end, steps=expected, finished=finished, external=external),
+        content.facts(end, steps=expected, finished=finished, checked=not reader.is_unchecked, external=external),
         strange=strange,
         part=part,
     )
@@ -297,7 +297,9 @@ class _Content:
             found.first += some.first
         return found
 
-    def facts(self, end: dict[str, str], *, steps: int, finished: bool, external: tuple[bool, ...]) -> Facts:
+    def facts(
+        self, end: dict[str, str], *, steps: int, finished: bool, checked: bool, external: tuple[bool, ...]
+    ) -> Facts:
         """What the census must know beside the messages."""
         _, first = np.unique(np.array(self._keys, dtype=np.int64), return_index=True)
         recorded = {
@@ -309,6 +311,7 @@ class _Content:
         return Facts(
             steps=steps,
             is_finished=finished,
+            is_checked=checked,
             has_start="start" in self._kinds,
             has_end="end" in self._kinds,
             events=np.array(self._events, dtype=np.int64)[first],

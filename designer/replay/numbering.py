@@ -21,6 +21,7 @@ class Numbering(NamedTuple):
 
     notes: tuple[str, ...] = ()  # that they are not the senders'
     faults: tuple[str, ...] = ()  # numbers that contradict each other
+    is_exchanged: bool = True  # every number is there once: messages were exchanged, no number is a wrong one
     unseen: tuple[str, ...] = ()  # numbers that nobody has, between those that are there
     events: int = 0  # messages that have no step of their own, and are not there
     is_part: bool = False  # these lack as they do where a part was taken
@@ -57,8 +58,13 @@ class _Sender:
             return int((self.numbers >= self.recorded).sum()) > most
         return last + 1 - len(self.numbers) - self._lacking - events > max(most, self.total // 2)
 
+    @property
+    def repeats(self) -> bool:
+        """A number stands on more than one message."""
+        return len(self._again) > 0
+
     def faults(self) -> list[str]:
-        again = [f"{self.who} has number {self._again[0]} on more than one message"] if len(self._again) else []
+        again = [f"{self.who} has number {self._again[0]} on more than one message"] if self.repeats else []
         return [*self._falls, *again]
 
     def unseen(self, events: Counter[int]) -> tuple[int, list[int], bool]:
@@ -132,9 +138,10 @@ def _senders(
 
 def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numbering:
     waiting = Counter(events.tolist())
-    unseen, total, is_part = [], 0, False
+    unseen, total, is_part, is_exchanged = [], 0, False, True
     for sender in senders:
         count, numbers, outermost = sender.unseen(waiting)
+        is_exchanged &= not sender.wrong or (not count and sender.wrong > 0 and not sender.repeats)
         count = count if absent is None else min(count, absent - total)
         total += count
         if count and (outermost or not len(events)):
@@ -144,6 +151,7 @@ def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numberi
             unseen.append(f"{count} more messages of {sender.who} are missing, by its numbers {first}")
     return Numbering(
         faults=tuple(fault for sender in senders for fault in sender.faults()),
+        is_exchanged=is_exchanged,
         unseen=tuple(unseen),
         events=total,
         is_part=is_part,

@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterable, Iterator
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from agent.contract.arrays import Array
 from agent.contract.keys import COORDINATOR, MODE, PLANT, PLANT_STATE, estimate, measurement, node_who
 from agent.contract.messages import ZERO_STATE, Estimate, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
@@ -150,66 +152,83 @@ class Topic:
         self.double: set[int] = set()  # steps of which there is another message, of other content
         self.faults = Sentences()  # messages that cannot be of this run
         self.unreadable = Sentences()  # messages that are none at all
-        self._model, self.places, self._may_be_empty = model, places, may_be_empty
-        self._widths = {name: at.stop - at.start for name, at in places.items()}
-        self.words = words
+        self.places, self.words, self._may_be_empty = places, words, may_be_empty
+        self._decode = model.__pydantic_validator__.validate_json  # what Message.decode calls
+        self._get = attrgetter(*places) if len(places) > 1 else None
+        self._tells_nothing = model is Estimate and "told" not in words
+        self._widths = tuple(at.stop - at.start for at in places.values())
         self._clear()
 
     def _clear(self) -> None:
         self._steps, self._numbers, self._times = array("q"), array("q"), array("q")
-        self._values = {name: array("d") for name in self.places}
+        self._values = array("d")  # the vectors of each message one after the other
         self._texts = {name: array("q") for name in self.words}
 
     def add(self, logged: Logged, columns: Columns, *, planned: int, modes: Words, senders: Senders) -> int:
         """Take in a message; returns its step, -1 where it cannot be read."""
         try:
-            message = self._model.decode(logged.payload)
+            message = self._decode(logged.payload)
         except ValidationError as error:
             words = error.errors(include_url=False)[0]["msg"].lower()
             self.unreadable.add(f"{self.topic}, number {logged.number}: {words}")
             return -1
-        fault = self._fault(message, planned)
-        if fault:
-            self.faults.add(f"{self.topic}, step {message.step}: {fault}")
-            return message.step
-        if isinstance(message, Mode) and message.index not in (-1, modes.number(message.mode)):
-            self.faults.add(f'{self.topic}, step {message.step}: index {message.index} is not that of "{message.mode}"')
-        self._steps.append(message.step)
+        step: int = message.step
+        vectors = self._vectors(message)
+        if step >= planned or tuple(map(len, vectors)) != self._widths:
+            vectors, fault = self._fitted(vectors) if step < planned else ((), f"the run has only {planned} steps")
+            if fault:
+                self.faults.add(f"{self.topic}, step {step}: {fault}")
+                return step
+        if self._tells_nothing and (message.origin or not message.measured):
+            self.faults.add(f"{self.topic}, step {step}: it says what only paced runs have to say")
+            return step
+        self._steps.append(step)
         self._numbers.append(logged.number)
         self._times.append(logged.log_time)
-        for name, values in self._values.items():
-            values.extend(getattr(message, name) or [math.nan] * self._widths[name])
-        if isinstance(message, Mode):
-            self._texts["mode"].append(modes.number(message.mode))
-        elif isinstance(message, Estimate):
+        for values in vectors:
+            self._values.extend(values)
+        if self.words:
+            self._add_words(message, modes, senders)
+        if len(self._steps) == _AT_ONCE:
+            self.settle(columns)
+        return step
+
+    def _vectors(self, message: Any) -> tuple[list[float], ...]:
+        if self._get is not None:
+            return self._get(message)
+        return tuple(getattr(message, name) for name in self.places)
+
+    def _fitted(self, vectors: tuple[list[float], ...]) -> tuple[tuple[list[float], ...], str]:
+        """The vectors, NaN in place of those that are empty and may be; and what is wrong with their lengths."""
+        fitted = []
+        for name, width, values in zip(self.places, self._widths, vectors, strict=True):
+            if len(values) != width and (values or not self._may_be_empty):
+                return (), f"{name} has {len(values)} numbers where the problem has {width}"
+            fitted.append(values or [math.nan] * width)
+        return tuple(fitted), ""
+
+    def _add_words(self, message: Message, modes: Words, senders: Senders) -> None:
+        if isinstance(message, Estimate):
             self._texts["used"].append(modes.number(message.mode))
             self._texts["heard"].append(senders.number(message.heard))
             if "told" in self._texts:
                 self._texts["told"].append(message.measured)
                 self._texts["origin"].append(senders.origin(message.origin))
-        if len(self._steps) == _AT_ONCE:
-            self.settle(columns)
-        return message.step
-
-    def _fault(self, message: Message, planned: int) -> str:
-        if message.step >= planned:
-            return f"the run has only {planned} steps"
-        for name, width in self._widths.items():
-            values = getattr(message, name)
-            if len(values) != width and (values or not self._may_be_empty):
-                return f"{name} has {len(values)} numbers where the problem has {width}"
-            if values and (max(values) > CEILING or min(values) < -CEILING):
-                return f"{name} holds {max(values, key=abs)}, beyond {CEILING:g}"
-        if isinstance(message, Estimate) and (message.origin or not message.measured) and "told" not in self.words:
-            return "it says what only paced runs have to say"
-        return ""
+        elif isinstance(message, Mode):
+            number = modes.number(message.mode)
+            self._texts["mode"].append(number)
+            if message.index not in (-1, number):
+                place = f"{self.topic}, step {message.step}"
+                self.faults.add(f'{place}: index {message.index} is not that of "{message.mode}"')
 
     def settle(self, columns: Columns) -> None:
         """Enter the messages that wait."""
         if not self._steps:
             return
-        steps = np.array(self._steps)
-        self.last = max(self.last, int(steps.max()))
+        values = np.array(self._values).reshape(len(self._steps), -1)
+        within = self._within(values)
+        steps = np.array(self._steps)[within]
+        self.last = max(self.last, int(steps.max(initial=-1)))
         columns.reach(self.last + 1)
         has = columns["has"][:, self.place]
         fresh = ~has[steps]
@@ -217,7 +236,7 @@ class Topic:
             first = np.zeros(len(steps), dtype=bool)
             first[np.unique(steps, return_index=True)[1]] = True
             fresh &= first
-        rows = dict(self._rows(columns))
+        rows = {name: (column, batch[within]) for name, (column, batch) in self._rows(columns, values)}
         for column, batch in rows.values():
             column[steps[fresh]] = batch[fresh]
         has[steps[fresh]] = True
@@ -225,12 +244,24 @@ class Topic:
             self._again(int(at), int(steps[at]), rows)
         self._clear()
 
-    def _rows(self, columns: Columns) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]]]]:
+    def _within(self, values: Array) -> NDArray[np.bool_]:
+        """Which of the messages that wait hold no number beyond the ceiling; the others are faults."""
+        beyond = np.abs(values) > CEILING
+        names = np.repeat(list(self.places), self._widths)
+        for row in np.flatnonzero(beyond.any(axis=1)):
+            column = int(np.argmax(beyond[row]))
+            what = f"{names[column]} holds {values[row, column]}, beyond {CEILING:g}"
+            self.faults.add(f"{self.topic}, step {self._steps[row]}: {what}")
+        return np.asarray(~beyond.any(axis=1))
+
+    def _rows(self, columns: Columns, values: Array) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]]]]:
         """The columns of this topic, and what waits to be written there."""
         yield "number", (columns["number"][:, self.place], np.array(self._numbers))
         yield "time", (columns["time"][:, self.place], np.array(self._times))
-        for name, at in self.places.items():
-            yield name, (columns[name][:, at], np.array(self._values[name]).reshape(-1, self._widths[name]))
+        first = 0
+        for (name, at), width in zip(self.places.items(), self._widths, strict=True):
+            yield name, (columns[name][:, at], values[:, first : first + width])
+            first += width
         for name, texts in self._texts.items():
             yield name, (columns[name][:, self.words[name]], np.array(texts))
 

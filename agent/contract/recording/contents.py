@@ -146,6 +146,8 @@ def _no_run(surveys: Sequence[Survey]) -> str:
         has += ": they look like those of a run, so a tool may have left the metadata out; copy it with metadata"
     if any(name == "run" for name, _ in survey.metadata):
         return f"{path} is an MCAP file, but not a recording of peakmesh: its run metadata are somebody else's{has}"
+    if survey.damage:
+        return f"{path} is cut or damaged, and what is left of it has no run metadata: {survey.damage[0]}{has}"
     return f"{path} is an MCAP file, but not a recording of peakmesh: it has no run metadata{has}"
 
 
@@ -189,16 +191,27 @@ def _no_gains(failures: list[str], wanted: str, surveys: Sequence[Survey], label
     return f"{label} has no gains: its attachment gains.json is missing, a filter may have left it out; {hint}"
 
 
-def altered(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
-    """Of the attachments whose digests the run names, those of which there is none that fits, a sentence each."""
+def unfit(run: Run, surveys: Sequence[Survey]) -> Iterator[tuple[str, bool]]:
+    """Of the attachments whose digests the run names, those of which there is none that fits: a sentence, and whether
+    a checksum vouches for what is there, so that somebody has altered it; else it is damaged, or may be."""
     for name, key, model in _DIGESTS:
         wanted = run.facts.get(key, "")
-        found = [_digest(survey, attached, model, wanted) for survey, attached in _named(name, surveys)]
-        if wanted and found and wanted not in found:
-            yield (
-                f"the attachment {name} was altered or exchanged: its digest is {found[-1][:12]}..., "
-                f"the run's is {wanted[:12]}..."
-            )
+        there = list(_named(name, surveys))
+        found = [_digest(survey, attached, model, wanted) for survey, attached in there]
+        if not wanted or not found or wanted in found:
+            continue
+        fits = _fits(*there[-1])
+        word = "is damaged: it does not fit its checksum" if fits is False else "was altered or exchanged"
+        digests = f"its digest is {found[-1][:12]}..., the run's is {wanted[:12]}..."
+        yield f"the attachment {name} {word}{'; ' if fits is False else ': '}{digests}", fits is True
+
+
+def _fits(survey: Survey, attached: Attached) -> bool | None:
+    """Whether an attachment fits its checksum, or that of the whole file; None where there is neither."""
+    crc = int.from_bytes(survey.source.read(attached.start + attached.size, 4), "little")
+    if not crc:
+        return True if survey.is_covered else None
+    return survey.source.checksum(attached.record, attached.start + attached.size) == crc
 
 
 def strangers(run: Run, surveys: Sequence[Survey]) -> Iterator[str]:
@@ -233,8 +246,7 @@ def _data(survey: Survey, attached: Attached) -> bytes:
     source = survey.source
     if attached.size > _LARGEST:
         raise InputError(f"{source.path}: the attachment {attached.name} has {attached.size} bytes")
-    crc = int.from_bytes(source.read(attached.start + attached.size, 4), "little")
-    if crc and source.checksum(attached.record, attached.start + attached.size) != crc:
+    if _fits(survey, attached) is False:
         raise InputError(f"{source.path}: the attachment {attached.name} is damaged: it does not fit its checksum")
     return source.read(attached.start, attached.size)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -16,10 +17,11 @@ from agent.contract.gains import Gains
 from agent.contract.recording import Logged, contents, records
 from agent.contract.recording.contents import Run
 from agent.contract.recording.naming import Naming
-from agent.contract.recording.records import Broken, Channel, RawMessage
+from agent.contract.recording.records import Broken, Channel, RawMessage, Schema
 from agent.contract.recording.source import Source
 from agent.contract.recording.survey import Survey, survey
 
+END_OF_TIME = 2**63  # ns; where times are later than this, bytes were changed
 NAMED = 3  # so many damages are told, the others counted
 
 Progress = Callable[[int, int], None]  # bytes read, of all
@@ -110,6 +112,10 @@ class RecordingReader:
             self._gains = contents.find_gains(self._chosen, self._surveys, self._given, label=self.label)
         return self._gains
 
+    @cached_property
+    def _unfit(self) -> list[tuple[str, bool]]:
+        return list(contents.unfit(self._chosen, self._surveys))
+
     @property
     def damages(self) -> list[str]:
         """What is wrong with the files, a sentence each; each begins with the file's name where there are several."""
@@ -117,6 +123,7 @@ class RecordingReader:
         for one in self._surveys:
             found += [self._of(one, sentence) for sentence in one.damage]
         found += self._lost
+        found += [sentence for sentence, vouched in self._unfit if not vouched]
         if self.is_doubtful and "recovered.checksum" not in self.run:
             found.append("it was changed after it was written: it does not fit its checksum")
         return found
@@ -133,7 +140,8 @@ class RecordingReader:
         """A checksum over everything fails, and nothing that was found explains it: any number may be a wrong one."""
         if self.run.get("recovered.checksum") == "failed":
             return True
-        return any(one.is_contradicted and not one.damage for one in self._surveys) and not self._lost
+        explained = self._lost or any(not vouched for _, vouched in self._unfit)
+        return any(one.is_contradicted and not one.damage for one in self._surveys) and not explained
 
     @property
     def notes(self) -> list[str]:
@@ -154,7 +162,7 @@ class RecordingReader:
     def faults(self) -> list[str]:
         """What was altered beside the messages."""
         told = self.run.get("recovered.faults")
-        return [*contents.altered(self._chosen, self._surveys), *([told] if told else [])]
+        return [*(sentence for sentence, vouched in self._unfit if vouched), *([told] if told else [])]
 
     @property
     def attached(self) -> list[str]:
@@ -215,18 +223,23 @@ class _Pass:
         self._naming = Naming(one)
         self._channels: dict[int, Channel] = {}
         self._topics: dict[int, str] = {}  # of a channel of the run
-        self._chunks = self._orphans = 0
+        self._chunks = self._orphans = self._timeless = 0
 
     def messages(self) -> Iterator[Logged]:
         first, before = self._reader.window
-        for raw in self._raw():
-            topic = self._topics.get(raw.channel) or self._unlearned(raw.channel)
+        topics, of_tuple = self._topics, tuple.__new__  # half the time of Logged(...)
+        for channel, sequence, log_time, publish_time, data in self._raw():
+            topic = topics.get(channel) or self._unlearned(channel)
             if topic is None:
                 continue
-            if first <= raw.log_time < before:
-                yield Logged(topic, raw.data, raw.sequence, raw.log_time, raw.publish_time)
+            if log_time >= END_OF_TIME or publish_time >= END_OF_TIME:
+                self._timeless += 1
+            elif first <= log_time < before:
+                yield of_tuple(Logged, (topic, data, sequence, log_time, publish_time))
             else:
                 self._reader.others += 1
+        if self._timeless:
+            self._reader.lose(self._survey, f"{counted(self._timeless, 'message')} have times that no clock gives")
         if self._orphans:
             self._reader.lose(self._survey, f"{counted(self._orphans, 'message')} are of channels not described in it")
 
@@ -252,12 +265,12 @@ class _Pass:
             chunk = records.chunk_of(body)
             self._reader.is_unchecked |= not chunk.crc and not self._survey.is_covered
             for record in records.records_in(records.unpacked(chunk)):
-                if isinstance(record, RawMessage):
-                    yield record
-                elif isinstance(record, Channel):
+                if isinstance(record, Channel):
                     self._learn(record)
-                else:
+                elif isinstance(record, Schema):
                     self._naming.learn(record)
+                else:
+                    yield record
         except Broken as error:
             of = f"chunk {self._chunks} of {self._survey.chunks}"
             self._reader.lose(self._survey, f"{of} {error}; its messages are lost")
