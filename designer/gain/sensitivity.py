@@ -28,6 +28,7 @@ class Sweep(NamedTuple):
     Gamma: Array  # (T, modes, nw, n_eta): the worst w is Gamma eta
     W_inverse: Array  # (T, modes, nw, nw): (g I - B'Y_bar B)^-1
     log_det: float  # sum over steps and modes of log det (I - B'Y_bar B / g)
+    Y: Array  # (modes, n_eta, n_eta): what weighs eta at the start of the horizon
 
 
 def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
@@ -41,7 +42,7 @@ def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
             return None
         Y_bars[k], inverses[k], Gammas[k], Y = taken.Y_bar, taken.W_inverse, taken.Gamma, taken.Y
         log_det += float(taken.log_det.sum())
-    return Sweep(Y_bars, Gammas, inverses, log_det)
+    return Sweep(Y_bars, Gammas, inverses, log_det, np.asarray(Y))
 
 
 class Slope(NamedTuple):
