@@ -28,7 +28,7 @@ from designer.search.entries import Entries
 from designer.search.starts import node_regression
 
 _DAMPING = 0.1  # added to a Hessian with 1 on its diagonal: only part of the Hessian is known
-_KAPPA = 1e-4
+_KAPPA = 1e-5
 _FLAT = 1e-12  # a curvature in y below this is none
 
 

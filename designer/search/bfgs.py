@@ -18,7 +18,7 @@ from agent.contract.arrays import Array
 Function = Callable[[Array], tuple[float, Array]]  # value and gradient
 Map = Callable[[Array], Array]  # a symmetric positive matrix times a vector
 
-_PAIRS = 60
+_PAIRS = 100
 
 
 class Pair(NamedTuple):
@@ -27,6 +27,7 @@ class Pair(NamedTuple):
     s: Array
     y: Array
     sy: float
+    scale: float  # s'y / y'(first y)
 
 
 class Point(NamedTuple):
@@ -36,7 +37,7 @@ class Point(NamedTuple):
     value: float
     gradient: Array
     first: Map  # an inverse Hessian to begin with
-    scale: float  # of `first`, by the last step: s'y / y'(first y)
+    scale: float  # of `first`: the largest s'y / y'(first y); the last one may be far too small at a kink
     pairs: tuple[Pair, ...]  # the oldest first
 
 
@@ -56,19 +57,20 @@ def step(function: Function, point: Point) -> Point | None:
     s, y, scale, pairs = t * direction, gradient - point.gradient, point.scale, point.pairs
     sy = float(s @ y)
     if sy > 0.0:
-        scale, pairs = sy / float(y @ point.first(y)), (*pairs[1 - _PAIRS :], Pair(s, y, sy))
+        pairs = (*pairs[1 - _PAIRS :], Pair(s, y, sy, sy / float(y @ point.first(y))))
+        scale = max(pair.scale for pair in pairs)
     return Point(point.x + s, value, gradient, point.first, scale, pairs)
 
 
 def _direction(point: Point) -> Array:
     """Minus the inverse Hessian times the gradient, by two loops over the pairs."""
     q, shares = point.gradient.copy(), []
-    for s, y, sy in reversed(point.pairs):
+    for s, y, sy, _ in reversed(point.pairs):
         share = float(s @ q) / sy
         shares.append(share)
         q -= share * y
     q = point.scale * point.first(q)
-    for (s, y, sy), share in zip(point.pairs, reversed(shares), strict=True):
+    for (s, y, sy, _), share in zip(point.pairs, reversed(shares), strict=True):
         q += (share - float(y @ q) / sy) * s
     return np.negative(q)
 
