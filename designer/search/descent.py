@@ -28,6 +28,7 @@ from designer.search import bfgs
 from designer.search.barrier import Barrier
 
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
+_NEAR = 3  # weights that are passed over where the start is near
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
 _RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
 _HORIZON = 20
@@ -38,7 +39,7 @@ _SHORT_OF_MU = 0.3
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
-_MOST_STEPS = 1000
+_MOST_STEPS = 300  # for each mu
 _NOTHING = 1e-200  # gamma^2 below this is 0
 
 
@@ -105,10 +106,11 @@ def descend(
     problem: Problem,
     starts: Mapping[str, StackedGains],
     *,
+    near: bool = False,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Descent:
-    """The least exact gain found from the best of the given starts.
+    """The least exact gain found from the best of the given starts; `near`: it is known not to be far from that.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
     returned.
@@ -116,7 +118,7 @@ def descend(
     search = _Search(problem, Budget() if budget is None else budget, progress)
     ended = "converged"
     try:
-        search.run(starts)
+        search.run(starts, _WEIGHTS[_NEAR:] if near else _WEIGHTS)
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:
@@ -140,14 +142,14 @@ class _Search:
         self.centred: list[Array] = []  # v of ever smaller gains
 
     # the way down
-    def run(self, starts: Mapping[str, StackedGains]) -> None:
-        """The best start by all weights, on longer horizons while T is too short; then to the centre."""
+    def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
+        """The best start by these weights, on longer horizons while T is too short; then to the centre."""
         found = {name: self._candidate(self.barrier.entries.pack(*gains)) for name, gains in starts.items()}
         self.start = min(found, key=lambda name: (found[name].gain.high, found[name].gain.radius))
         v = self.barrier.entries.pack(*starts[self.start])
         if found[self.start].gain.stable:
             self.stable.append(v)
-        x, radius, left = self._begin(v), math.inf, list(_WEIGHTS)
+        x, radius, left = self._begin(v), math.inf, list(weights)
         while left:
             point = self._follow(left[0], x)
             x = point.x
