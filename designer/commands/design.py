@@ -81,9 +81,7 @@ def design_command(options: argparse.Namespace) -> int:
         return _price_command(problem, options)
     if options.dask is not None:
         raise InputError("--dask spreads the many designs of --price; a single design runs here")
-    _, result = design_and_save(
-        problem, options.method, options.output, force=options.force, budget=options.budget
-    )
+    _, result = design_and_save(problem, options.method, options.output, force=options.force, budget=options.budget)
     print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
 
@@ -118,7 +116,9 @@ def design_and_save(
     method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
     gains = design(problem, method=method, budget=budget, progress=_descent_progress())
     if gains.solver.status.startswith("out of time"):
-        print(f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr)
+        print(
+            f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
+        )
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {

@@ -47,9 +47,7 @@ def demo_command(options: argparse.Namespace) -> int:
     for path in (gains_path, options.output, page):
         refuse_overwrite(path, force=options.force)
 
-    gains, designed = design_and_save(
-        problem, options.method, gains_path, force=options.force, budget=options.budget
-    )
+    gains, designed = design_and_save(problem, options.method, gains_path, force=options.force, budget=options.budget)
     _say(options, f"1. design\n{design_text(designed)}")
     ran = agent.commands.run.run_gains(gains_path, gains, options)
     if ran["broken_off"]:

@@ -28,7 +28,8 @@ from designer.search.entries import Entries
 from designer.search.starts import node_regression
 
 _DAMPING = 0.1  # added to a Hessian with 1 on its diagonal: only part of the Hessian is known
-_KAPPA = 1e-5
+_KAPPA = 1e-5  # of the descent: its part of gamma is not seen
+_KAPPA_OF_CENTRE = 1.0  # as if what is left at the end were one step more
 _FLAT = 1e-12  # a curvature in y below this is none
 
 
@@ -92,13 +93,13 @@ class Barrier:
         return J
 
     def centre(self, y: float, ridge: float) -> bfgs.Function:
-        """The same with g held, and the size of the gains in place of y: -sum of log det + ridge |v|^2 / 2.
+        """The same with g held, and the size of the gains in place of y: -sum of log det + ridge |v|^2 / 2 + a term as in J.
 
         The sum is least where the responses of all horizons together are small: for gains that decay fast.
         """
 
         def J(v: Array) -> tuple[float, Array]:
-            value, gradient = self._inside(np.append(v, y), 0.0)
+            value, gradient = self._inside(np.append(v, y), _KAPPA_OF_CENTRE)
             return ridge / 2.0 * float(v @ v) + value, ridge * v + gradient[:-1]
 
         return J

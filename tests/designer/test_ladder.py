@@ -101,7 +101,9 @@ def test_the_estimate_grows_with_the_square_of_large_networks() -> None:
 def test_memory_that_does_not_suffice_is_said_before() -> None:
     problem = banded(50)
     refuse_without_memory(problem, free=1e9)
-    with pytest.raises(InputError, match=r"needs about 0\.2 GB of memory for 50 nodes and 4 modes, and 0\.1 GB are free"):
+    with pytest.raises(
+        InputError, match=r"needs about 0\.2 GB of memory for 50 nodes and 4 modes, and 0\.1 GB are free"
+    ):
         refuse_without_memory(problem, free=1e8)
 
 

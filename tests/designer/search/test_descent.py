@@ -83,10 +83,10 @@ def test_starts_agree_on_the_pendulum_whose_states_are_of_different_size(monkeyp
     assert agree(alone(problem, starts))
 
 
-def test_gains_are_chosen_on_the_way_where_the_smallest_are_not_stable(ideal: Descent) -> None:
-    """In the paper's first example centring ends at errors that grow, too slowly for the horizon."""
+def test_gains_are_chosen_that_are_smaller_or_faster(ideal: Descent) -> None:
+    """In the paper's first example the least gamma is that of large gains whose errors decay slowly."""
     assert ideal.chosen.gain.high <= 1.00101 * ideal.least.gain.high
-    assert ideal.chosen.cost < 0.5 * ideal.least.cost
+    assert ideal.chosen.cost < 0.2 * ideal.least.cost
 
 
 def test_any_start_leads_to_the_answer_that_is_known() -> None:
