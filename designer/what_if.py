@@ -25,7 +25,6 @@ from designer.proof.certificate import lyapunov_matrix
 from designer.search.effort import default_method
 from designer.workers import each, greet_cluster
 
-
 _SHARE = 0.5  # of the time of a design that one from near gains takes
 
 
@@ -127,8 +126,8 @@ def price(
 ) -> PriceTable:
     """Design the whole network, then without each part in turn, on the processes of `designer.workers.each`.
 
-    Method "exact" starts each of these from the whole network's gains, and goes to the end of each search. `report` gets how many designs are done, of
-    how many, and the last of them in words.
+    Method "exact" starts each of these from the whole network's gains, and goes to the end of each search. `report`
+    gets how many designs are done, of how many, and the last of them in words.
     """
     if dask is not None:
         greet_cluster(dask)  # before the first design, which may take minutes

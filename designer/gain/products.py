@@ -34,12 +34,13 @@ class Pattern:
     """Where [A B], H and R may have numbers, as far as `model` shows it; the same for all gains of a problem."""
 
     def __init__(self, model: ErrorModel) -> None:
-        filled = np.concatenate([model.A, model.B], axis=2).any(axis=0)
+        filled = np.asarray((np.concatenate([model.A, model.B], axis=2) != 0.0).any(axis=0))
         self.rows, self.columns = _groups(filled), _groups(filled.T)
         modes, p, size, both = model.modes, model.plant_states, model.size, model.size + model.nw
         self.lossy = np.flatnonzero(model.alpha[model.owner] > 0.0)  # measurements that may be lost
         owner = model.owner[self.lossy]
         self.a, self.b = np.nonzero(owner[:, None] == owner)  # pairs that are lost together
+        self.first = np.searchsorted(self.a, np.arange(len(self.lossy)))  # of the pairs (a, b) of each a
         mode = np.arange(modes)[:, None, None, None]
         self.H_rows = _kept(model.H[:, :, self.lossy].swapaxes(1, 2))  # (modes, lossy, r)
         rows, columns = p + self.H_rows, _kept(model.R[self.lossy])
@@ -145,7 +146,7 @@ class Products:
             self.pattern.in_Y.add(X, lost[:, :, None, None] * self._HH)
             if collected is not None and Y_bar is not None:
                 by_H = self.pattern.in_Y.take(Y_bar) @ self._H[:, self.pattern.b, :, None]
-                np.add.at(collected.H, (slice(None), self.pattern.a), by_H[..., 0] * lost[:, :, None])
+                collected.H += np.add.reduceat(by_H[..., 0] * lost[:, :, None], self.pattern.first, axis=1)
         return X
 
 

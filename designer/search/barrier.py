@@ -93,9 +93,10 @@ class Barrier:
         return J
 
     def centre(self, y: float, ridge: float) -> bfgs.Function:
-        """The same with g held, and the size of the gains in place of y: -sum of log det + ridge |v|^2 / 2 + a term as in J.
+        """The same with g held, and the size of the gains in place of y: -sum of log det + ridge |v|^2 / 2.
 
-        The sum is least where the responses of all horizons together are small: for gains that decay fast.
+        The sum is least where the responses of all horizons together are small: for gains that decay fast. What is
+        left at the end of the horizon is as in J, with much more weight.
         """
 
         def J(v: Array) -> tuple[float, Array]:

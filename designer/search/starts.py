@@ -12,7 +12,7 @@ Where that covariance settles, the error system is mean-square stable, so these 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,14 +144,14 @@ class _Batch(NamedTuple):
 
 def _batches(problem: Problem, entries: Entries) -> list[_Batch]:
     """The regressions of all nodes in all modes, those of one shape together."""
-    found: dict[tuple[int, ...], list[tuple[Indices, ...]]] = {}
+    found: dict[tuple[int, ...], list[tuple[Any, ...]]] = {}
     for (s, i), at in entries.nodes.items():
         regression = node_regression(problem, s, i)
         c, rows = regression.columns, np.array([s])
         both = regression.t.shape[1]
         moments = (rows[:, None] * both + c[:, None]) * both + c
-        noises = np.array([V[:, c] for V in regression.noises]).reshape(-1, len(regression.mean), len(c))
-        parts = (at, moments, regression.t[:, c], regression.mean[:, c], noises)
+        noises: Array = np.array([V[:, c] for V in regression.noises]).reshape(-1, len(regression.mean), len(c))
+        parts: tuple[Any, ...] = (at, moments, regression.t[:, c], regression.mean[:, c], noises)
         found.setdefault(tuple(size for part in parts for size in part.shape), []).append(parts)
     return [_Batch(*map(np.array, zip(*alike, strict=True))) for alike in found.values()]
 
