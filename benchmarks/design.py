@@ -1,6 +1,7 @@
 """What a design costs and what it gives: the tables of docs/theory.md, measured anew.
 
-    python benchmarks/design.py [--decomposed 4 8 12 25 50 100 200] [--literal 4 8 12] [--exact 4 6 20]
+    python benchmarks/design.py [--decomposed 4 8 12 25 50 100 200] [--literal 4 8 12]
+                                [--exact 4 6 20 50 100 200] [--budget SECONDS]
                                 [--networks zhu2020-ideal zhu2020-lossy ring-1 ...] [--seed 1]
 
 First the networks `banded`, with 4 modes and 2 states: the paper's LMI as printed beside the decomposed one, large
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -37,10 +39,15 @@ import json, resource, sys, time
 from agent.contract.gains import Gains
 from benchmarks.design import network
 from designer.proof.certificate import verify
+from designer.search.descent import Budget
+from designer.search.exact_design import design_exact
 from designer.synthesis import design
-problem = network(sys.argv[2], seed=int(sys.argv[3]))
+problem, budget = network(sys.argv[2], seed=int(sys.argv[3])), float(sys.argv[4])
 started, cpu = time.perf_counter(), time.process_time()
-gains = design(problem, method=sys.argv[1])
+if sys.argv[1] == "exact":
+    gains = design_exact(problem, budget=Budget(budget, clock=time.process_time))
+else:
+    gains = design(problem, method=sys.argv[1])
 whole, cpu = time.perf_counter() - started, time.process_time() - cpu
 started, proved = time.process_time(), gains.certificate
 assert verify(Gains.from_bytes(gains.canonical(), source="memory")).holds
@@ -143,9 +150,9 @@ NETWORKS: dict[str, Callable[..., Problem]] = {
 }
 
 
-def measure(method: str, name: str, seed: int) -> dict[str, Any]:
-    """One design in a process of its own."""
-    child = [sys.executable, "-c", CHILD, method, name, str(seed)]
+def measure(method: str, name: str, seed: int, budget: float = math.inf) -> dict[str, Any]:
+    """One design in a process of its own; `budget`: of processor time, for the method "exact"."""
+    child = [sys.executable, "-c", CHILD, method, name, str(seed), str(budget)]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # as the program does
     done = subprocess.run(child, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
@@ -204,7 +211,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="What a design costs and what it gives.")
     parser.add_argument("--literal", type=int, nargs="*", default=[4, 8, 12], metavar="NODES")
     parser.add_argument("--decomposed", type=int, nargs="*", default=[4, 8, 12, 25, 50, 100, 200], metavar="NODES")
-    parser.add_argument("--exact", type=int, nargs="*", default=[4, 6, 20], metavar="NODES")
+    parser.add_argument("--exact", type=int, nargs="*", default=[4, 6, 20, 50, 100, 200], metavar="NODES")
+    parser.add_argument(
+        "--budget", type=float, default=math.inf, metavar="SECONDS", help="for exact, of processor time"
+    )
     parser.add_argument("--networks", nargs="*", default=list(NETWORKS), choices=list(NETWORKS), metavar="NAME")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
@@ -214,7 +224,7 @@ def main() -> None:
     if plan:
         print(HEAD)
     for method, n in plan:
-        measured[method, n] = measure(method, f"banded-{n}", options.seed)
+        measured[method, n] = measure(method, f"banded-{n}", options.seed, options.budget)
         print(row(method, n, measured[method, n]), flush=True)
     print("\n".join(summary(measured)))
     if options.networks:

@@ -15,19 +15,25 @@ from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
 from designer.model.error_model import error_model, stacked_gains
 from designer.proof.certificate import lyapunov_matrix
-from designer.search.descent import Progress
-from designer.search.effort import default_method
+from designer.search.descent import Budget, Progress
+from designer.search.effort import BUDGET, default_method
 from designer.search.exact_design import confirmed, design_exact
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
-def design(problem: Problem, *, method: str | None = None, progress: Callable[[Progress], None] | None = None) -> Gains:
+def design(
+    problem: Problem,
+    *,
+    method: str | None = None,
+    budget: float = BUDGET,
+    progress: Callable[[Progress], None] | None = None,
+) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
-    The default method is "exact" where that takes at most about ten minutes, else "decomposed".
-    `progress` is called during the method "exact" only, which also returns its best gains on KeyboardInterrupt.
+    The default method is "exact" up to 200 nodes, else "decomposed". `progress` and `budget` are for the method
+    "exact", which returns its best gains when its seconds are over, the proof after that, and on KeyboardInterrupt.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.
     """
@@ -38,7 +44,7 @@ def design(problem: Problem, *, method: str | None = None, progress: Callable[[P
     refuse_hopeless(problem)
     try:
         if method == EXACT:
-            gains = design_exact(problem, progress=progress)
+            gains = design_exact(problem, budget=Budget(budget), progress=progress)
         else:
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:

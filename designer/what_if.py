@@ -25,6 +25,8 @@ from designer.proof.certificate import lyapunov_matrix
 from designer.search.effort import default_method
 from designer.workers import each, greet_cluster
 
+_SHARE = 0.5  # of the time of a design that one from near gains takes
+
 
 # the problem without a part
 def without_node(problem: Problem, name: str) -> Problem:
@@ -73,7 +75,8 @@ class Priced(NamedTuple):
     part: str  # "node" or "link"
     name: str  # of the node, or A:B for what A hears from B
     before: float  # what the whole network's gains do for the nodes that remain; computed, where nodes are fewer
-    gamma: float | None  # certified without the part; None where nothing is
+    kept: float | None  # what those gains do without the part; computed; None where the errors are not stable
+    gamma: float | None  # certified without the part, designed anew; None where nothing is
     reason: str | None  # why nothing is certified
 
     @property
@@ -110,7 +113,7 @@ class _Job(NamedTuple):
 
 def price_method(problem: Problem) -> str:
     """The default: exact where all the designs together take at most about ten minutes, else decomposed."""
-    return default_method(problem, designs=1.0 + 0.5 * len(_parts(problem)))  # a start at hand saves half
+    return default_method(problem, designs=1.0 + _SHARE * len(_parts(problem)))
 
 
 def price(
@@ -123,8 +126,8 @@ def price(
 ) -> PriceTable:
     """Design the whole network, then without each part in turn, on the processes of `designer.workers.each`.
 
-    Method "exact" starts each of these from the whole network's gains. `report` gets how many designs are done, of
-    how many, and the last of them in words.
+    Method "exact" starts each of these from the whole network's gains, and goes to the end of each search. `report`
+    gets how many designs are done, of how many, and the last of them in words.
     """
     if dask is not None:
         greet_cluster(dask)  # before the first design, which may take minutes
@@ -149,15 +152,17 @@ def price_text(table: PriceTable) -> str:
     if not table.rows:
         return f"{lines[0]}\nthere is one node and no link: nothing can be left out"
     width = max(12, *(len(f"{row.part} {row.name}") for row in table.rows))
-    values = [value for row in table.rows for value in (row.gamma, row.before) if value is not None]
+    values = [value for row in table.rows for value in (row.gamma, row.kept, row.before) if value is not None]
     columns = max(8, *(len(rounded_up(value)) for value in values))
-    lines.append(f"{'left out':{width}}  {'gamma':{columns}}  {'before':{columns}}  cost")
+    lines.append(f"{'left out':{width}}  {'gamma':{columns}}  {'kept':{columns}}  {'before':{columns}}  cost")
     for row in table.rows:
-        gamma, cost = (rounded_up(row.gamma), percent(row.cost)) if row.gamma is not None else ("no bound", "")
-        before = f"{gamma:{columns}}  {rounded_up(row.before):{columns}}"
-        lines.append(f"{f'{row.part} {row.name}':{width}}  {before}  {cost}{row.reason or ''}")
+        cost = "" if row.gamma is None else percent(row.cost)
+        gamma, kept = ("no bound" if value is None else rounded_up(value) for value in (row.gamma, row.kept))
+        numbers = f"{gamma:{columns}}  {kept:{columns}}  {rounded_up(row.before):{columns}}"
+        lines.append(f"{f'{row.part} {row.name}':{width}}  {numbers}  {cost}{row.reason or ''}")
     lines += [
         "gamma      certified, designed anew without the part; it is over the nodes that remain",
+        "kept       for those same nodes, by the whole network's gains without the part; computed, not proved",
         "before     for those same nodes, by the whole network's gains; computed, not proved, where a node is gone",
         "link A:B   what A hears from B",
     ]
@@ -178,6 +183,8 @@ def _parts(problem: Problem) -> list[tuple[str, str, Problem]]:
 
 def _priced(job: _Job) -> Priced:
     """The job's design; that there is no certificate is an answer."""
+    bounds = exact_gain(error_model(job.problem, *job.start)).bounds
+    kept = None if bounds is None else bounds[1]
     try:
         try:
             gamma = _design(job.problem, job.method, job.start).certificate.gamma
@@ -186,8 +193,8 @@ def _priced(job: _Job) -> Priced:
                 raise
             gamma = _design(job.problem, job.method).certificate.gamma  # the start at hand was a bad one
     except Unattainable as error:
-        return Priced(job.part, job.name, job.before, None, str(error))
-    return Priced(job.part, job.name, job.before, gamma, None)
+        return Priced(job.part, job.name, job.before, kept, None, str(error))
+    return Priced(job.part, job.name, job.before, kept, gamma, None)
 
 
 def _design(problem: Problem, method: str, start: StackedGains | None = None) -> Gains:
@@ -195,9 +202,9 @@ def _design(problem: Problem, method: str, start: StackedGains | None = None) ->
     from designer.synthesis import design
 
     if method == "exact" and start is not None:
-        gains = design_exact(problem, starts={"whole network": start})
+        gains = design_exact(problem, starts={"whole network": start}, near=True)
     else:
-        gains = design(problem, method=method)
+        gains = design(problem, method=method, budget=math.inf)
     if gains.solver.status.startswith("interrupted"):  # the best gains so far are no price
         raise KeyboardInterrupt
     return gains

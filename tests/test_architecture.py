@@ -78,7 +78,7 @@ DOORS = {
     "clarabel": ["designer/lmi/"],
     "scipy": [
         "designer/lmi/",
-        "designer/gain/exact.py",
+        "designer/gain/products.py",
         "designer/proof/float_model.py",
         "designer/proof/machine.py",
         "designer/identify/fit.py",

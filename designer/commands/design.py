@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
     "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster "
-    "(default: exact where it takes at most about ten minutes, else decomposed)"
+    "(default: exact up to 200 nodes, else decomposed)"
 )
 
 
@@ -55,6 +56,20 @@ def add_design(commands: Subcommands) -> None:
 def add_method(parser: argparse.ArgumentParser) -> None:
     """Add the option of every command that designs."""
     parser.add_argument("--method", metavar="NAME", help=METHODS)
+    parser.add_argument(
+        "--budget",
+        type=duration,
+        metavar="TIME",
+        help="how long method exact may search: 90s, 10min, 2h; what it has then is certified (10min)",
+    )
+
+
+def duration(text: str) -> float:
+    """Seconds of "90s", "10min", "2h", "90"."""
+    found = re.fullmatch(r"(\d+(?:\.\d*)?)(s|min|h|)", text)
+    if found is None or not float(found[1]):
+        raise argparse.ArgumentTypeError(f'"{text}" is no time; write 90s, 10min or 2h')
+    return float(found[1]) * {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}[found[2]]
 
 
 def design_command(options: argparse.Namespace) -> int:
@@ -66,7 +81,7 @@ def design_command(options: argparse.Namespace) -> int:
         return _price_command(problem, options)
     if options.dask is not None:
         raise InputError("--dask spreads the many designs of --price; a single design runs here")
-    _, result = design_and_save(problem, options.method, options.output, force=options.force)
+    _, result = design_and_save(problem, options.method, options.output, force=options.force, budget=options.budget)
     print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
 
@@ -85,19 +100,25 @@ def _what_is_left(problem: Problem, nodes: list[str], links: list[str]) -> Probl
 
 
 def design_and_save(
-    problem: Problem, method: str | None, output: Path | None, *, force: bool
+    problem: Problem, method: str | None, output: Path | None, *, force: bool, budget: float | None = None
 ) -> tuple[Gains, dict[str, Any]]:
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
     from designer.diagnosis import warnings
     from designer.ladder import ladder_of
+    from designer.search.effort import BUDGET
     from designer.synthesis import design  # only now: it loads a solver
 
     warned = warnings(problem)
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
-    gains = design(problem, method=_chosen_method(problem) if method is None else method, progress=_descent_progress())
+    method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
+    gains = design(problem, method=method, budget=budget, progress=_descent_progress())
+    if gains.solver.status.startswith("out of time"):
+        print(
+            f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
+        )
     gains.save(path, force=force)
     proved = gains.certificate
     return gains, {
@@ -117,18 +138,20 @@ def design_and_save(
     }
 
 
-def _chosen_method(problem: Problem) -> str:
+def _chosen_method(problem: Problem, budget: float | None) -> str:
     """The default for this problem; on stderr why, where it is not the best one or takes long."""
-    from designer.search.effort import LONG, default_method, in_words, seconds_of_exact
+    from designer.search.effort import BUDGET, LONG, MOST_NODES, default_method, in_words, seconds_of_exact
 
-    method, seconds = default_method(problem), seconds_of_exact(problem)
+    method, seconds, budget = default_method(problem), seconds_of_exact(problem), BUDGET if budget is None else budget
     if method != "exact":
+        print(f"method {method}: there are more than {MOST_NODES} nodes; --method exact asks for it", file=sys.stderr)
+    elif min(seconds, budget) > LONG:
+        so_far = f" of about {in_words(seconds)}" if seconds > budget else ""
         print(
-            f"method {method}: exact would take about {in_words(seconds)} here; --method exact asks for it",
+            f"method exact: it takes about {in_words(min(seconds, budget))}{so_far} here; --budget 1min less, and "
+            "--method decomposed is faster",
             file=sys.stderr,
         )
-    elif seconds > LONG:
-        print(f"method exact: it takes about {in_words(seconds)} here; --method decomposed is faster", file=sys.stderr)
     return method
 
 
@@ -171,6 +194,8 @@ def _price_command(problem: Problem, options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM --price`."""
     from designer.what_if import price, price_method, price_text
 
+    if options.budget is not None:
+        raise InputError("--budget is for one design; --price goes to the end of each search, that all compare")
     if options.output is not None:
         raise InputError("--price writes no gains file; leave --output out, or --price")
     method = price_method(problem) if options.method is None else options.method

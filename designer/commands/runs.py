@@ -47,7 +47,7 @@ def demo_command(options: argparse.Namespace) -> int:
     for path in (gains_path, options.output, page):
         refuse_overwrite(path, force=options.force)
 
-    gains, designed = design_and_save(problem, options.method, gains_path, force=options.force)
+    gains, designed = design_and_save(problem, options.method, gains_path, force=options.force, budget=options.budget)
     _say(options, f"1. design\n{design_text(designed)}")
     ran = agent.commands.run.run_gains(gains_path, gains, options)
     if ran["broken_off"]:
@@ -82,8 +82,9 @@ def run_command(options: argparse.Namespace) -> int:
     """`peakmesh run PROBLEM_OR_GAINS`: a problem is designed first, its gains stand beside the recording."""
     path = Path(options.gains)
     if path.suffix == ".json" or (path.is_file() and path.suffix != ".toml"):
-        if options.method is not None:
-            raise InputError(f"--method says how to design a problem; {path} has its gains already")
+        for option in ("method", "budget"):
+            if getattr(options, option) is not None:
+                raise InputError(f"--{option} says how to design a problem; {path} has its gains already")
         options.gains = path
         return agent.commands.run.run_command(options)
     from agent.contract.recording.parts import refuse_recording
@@ -95,7 +96,7 @@ def run_command(options: argparse.Namespace) -> int:
         options.output = default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_recording(options.output, force=options.force)
     path = options.output.with_suffix(".gains.json")
-    gains, _ = design_and_save(problem, options.method, path, force=options.force)
+    gains, _ = design_and_save(problem, options.method, path, force=options.force, budget=options.budget)
     print(f"designed {path}, gamma = {rounded_up(gains.certificate.gamma)}", file=sys.stderr)
     ran = agent.commands.run.run_gains(path, gains, options, recording_plan_of(options))
     print(json.dumps({"gains": str(path), **ran}) if options.json else f"{run_text(ran)}\ngains      {path}")

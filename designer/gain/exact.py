@@ -9,19 +9,18 @@ In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.j
 from __future__ import annotations
 
 import math
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.model.error_model import ErrorModel, Indices, LinkTerms
+from designer.gain.products import Collected, Pattern, Products
+from designer.model.error_model import ErrorModel, LinkTerms
 
 _WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
 _TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
-_SPARSE = 1 / 12  # of the entries of [A B]; where fewer are not 0, zeros are left out: from about 40 nodes on
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
 _STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
 
@@ -51,25 +50,19 @@ class Gain(NamedTuple):
 
 
 class Operator:
-    """The matrices of (10)(11) in the shapes that the recursions multiply by."""
+    """The matrices of (10)(11) in the shapes that the recursions multiply by.
 
-    def __init__(self, model: ErrorModel) -> None:
-        modes, size, p = model.modes, model.size, model.plant_states
-        self.AB = np.concatenate([model.A, model.B], axis=2)  # (modes, n_eta, n_eta + nw)
-        self.AB_T = np.ascontiguousarray(self.AB.swapaxes(1, 2))
-        lossy = np.flatnonzero(model.alpha[model.owner] > 0.0)  # measurements that may be lost
-        owner, roots = model.owner[lossy], np.sqrt(model.alpha[model.owner[lossy]])
-        self.lossy = lossy
-        self.H = model.H[:, :, lossy] * roots  # sqrt(alpha_i) H of them, (modes, n nx, lossy)
-        self.H_T = np.ascontiguousarray(self.H.swapaxes(1, 2))
-        self.same = (owner[:, None] == owner).astype(np.float64)  # 1 where two measurements are lost together
-        self.R = model.R[lossy]
-        self.R_T = np.ascontiguousarray(self.R.T)
-        self.links = None if model.links is None else _Links(model.links, modes, size + model.nw, p)
+    `pattern`: where they may have numbers; without one, where these have.
+    """
+
+    def __init__(self, model: ErrorModel, pattern: Pattern | None = None) -> None:
+        modes, size = model.modes, model.size
+        self.products = Products(model, Pattern(model) if pattern is None else pattern)
+        self.links = None if model.links is None else _Links(model.links, modes, size + model.nw, model.plant_states)
         self.MM = np.broadcast_to(model.M.T @ model.M, (modes, size, size))
         self.M = model.M
         self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
-        self.p, self.size, self.nw = p, size, model.nw
+        self.p, self.size, self.nw = model.plant_states, size, model.nw
         self.eye_w = np.eye(self.nw)
 
     def bar(self, Y: Array) -> Array:
@@ -81,74 +74,25 @@ class Operator:
 
         Y_bar is symmetric; the result is (modes, n_eta + nw, n_eta + nw).
         """
-        S = self._full(Y_bar) if self.sparse is None else self.sparse.joint(Y_bar)
+        S = self.products.joint(Y_bar)
         if self.links is not None:
             self.links.add(S, Y_bar)
         return S
-
-    def _full(self, Y_bar: Array) -> Array:
-        """`joint` without links. With F_i = -H_i R_i the sum is R'(H'Y_bar H, its blocks of each node)R."""
-        S = self.AB_T @ (Y_bar @ self.AB)
-        if len(self.lossy):
-            G = (self.H_T @ (Y_bar[:, self.p :, self.p :] @ self.H)) * self.same
-            S += self.R_T @ (G @ self.R)
-        return np.asarray(S)
-
-    @cached_property
-    def sparse(self) -> _Sparse | None:
-        """The same without the zeros, where these are most: a node of a large network hears few others."""
-        return _Sparse(self) if np.count_nonzero(self.AB) < _SPARSE * self.AB.size else None
 
     def corner(self, Y: Array) -> Array:
         """L(Y) = A'Y_bar A + sum of alpha_i F_i'Y_bar F_i, the mean of Y one step later, (modes, n_eta, n_eta)."""
         return self.joint(self.bar(Y))[:, : self.size, : self.size]
 
-    def carry(self, joint: Array) -> Array:
+    def carry(self, joint: Array, collected: Collected | None = None, Y_bar: Array | None = None) -> Array:
         """E[eta(k+1) eta(k+1)'; r(k+1)] by mode, (modes, n_eta, n_eta), from `joint`, that of [eta; w] at k.
 
         The adjoint of L: `joint` has E[[eta; w][eta; w]'; r(k) = s] for every s, (modes, n_eta + nw, n_eta + nw).
+        `collected` gets the derivatives of what Y_bar weighs, but for those by the links.
         """
-        X = self.AB @ joint @ self.AB_T
-        if len(self.lossy):
-            X[:, self.p :, self.p :] += self.H @ ((self.R @ joint @ self.R_T) * self.same) @ self.H_T
+        X = self.products.carry(joint, collected, Y_bar)
         if self.links is not None:
             self.links.carry(X, joint)
         return np.asarray((self.transition.T @ X.reshape(len(X), -1)).reshape(X.shape))
-
-
-class _Sparse:
-    """`Operator.joint` without links for a large network; Y_bar is full all the same."""
-
-    def __init__(self, operator: Operator) -> None:
-        from scipy import sparse  # takes 0.2 s to import
-
-        modes, p, size = len(operator.AB), operator.p, operator.size
-        self.size, self.both = size, size + operator.nw
-        self.AB_T: Any = sparse.block_diag([sparse.csr_array(AB_T) for AB_T in operator.AB_T], format="csr")
-        a, b = np.nonzero(operator.same)  # pairs of measurements that are lost together
-        mode = np.arange(modes)[:, None, None, None]
-        rows, H = _kept(operator.H_T)  # (modes, lossy, r)
-        rows += p
-        self.at_HH = (mode * size + rows[:, a, :, None]) * size + rows[:, b, None, :]  # in Y_bar
-        self.HH = H[:, a, :, None] * H[:, b, None, :]  # (modes, pairs, r, r)
-        columns, R = _kept(operator.R)  # (lossy, c)
-        self.at_RR = (mode * self.both + columns[a, :, None]) * self.both + columns[b, None, :]  # in S
-        self.RR = R[a, :, None] * R[b, None, :]  # (pairs, c, c)
-
-    def joint(self, Y_bar: Array) -> Array:
-        """[A B]'([A B]'Y_bar)', and H_a'Y_bar H_b R_a'R_b of every pair (a, b)."""
-        half = (self.AB_T @ Y_bar.reshape(-1, self.size)).reshape(-1, self.both, self.size)
-        S = self.AB_T @ half.swapaxes(1, 2).reshape(-1, self.both)
-        G = (Y_bar.reshape(-1)[self.at_HH] * self.HH).sum(axis=(2, 3), keepdims=True)
-        S += np.bincount(self.at_RR.reshape(-1), (G * self.RR).reshape(-1), minlength=S.size).reshape(S.shape)
-        return np.asarray(S).reshape(-1, self.both, self.both)
-
-
-def _kept(X: Array) -> tuple[Indices, Array]:
-    """Where rows are not 0, and what is there: both (..., c), where the fullest row has c entries."""
-    most = int(np.count_nonzero(X, axis=-1).max(initial=0))
-    at = np.argsort(X == 0.0, axis=-1, kind="stable")[..., :most]
-    return at, np.take_along_axis(X, at, axis=-1)
 
 
 class _Links:
@@ -175,11 +119,8 @@ class _Links:
         np.add.at(X, self.block, self.V @ (joint[self.columns] @ self.V_T))
 
     def by_V(self, Y_bar: Array, joint: Array) -> Array:
-        """Derivative of sum tr(V_l'Y_bar V_l cov) by every V_l, summed over the steps, (terms, nx, c)."""
-        steps = zip(Y_bar, joint, strict=True)
-        return np.asarray(
-            2.0 * self.roots * sum(Y_k[self.block] @ (self.V @ joint_k[self.columns]) for Y_k, joint_k in steps)
-        )
+        """Derivative of sum tr(V_l'Y_bar V_l cov) by every V_l, (terms, nx, c)."""
+        return np.asarray(2.0 * self.roots * (Y_bar[self.block] @ (self.V @ joint[self.columns])))
 
 
 class Step(NamedTuple):

@@ -9,6 +9,7 @@ docstrings B'Y_bar B, B'Y_bar A and A'Y_bar A are the blocks of `Operator.joint`
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,8 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator, horizon_gain, horizon_holds, step
-from designer.model.error_model import ErrorModel, LinkTerms, error_model, stacks
+from designer.gain.products import Collected, Pattern
+from designer.model.error_model import ErrorModel, Indices, LinkTerms, error_model, stacks
 
 
 class Sweep(NamedTuple):
@@ -26,6 +28,7 @@ class Sweep(NamedTuple):
     Gamma: Array  # (T, modes, nw, n_eta): the worst w is Gamma eta
     W_inverse: Array  # (T, modes, nw, nw): (g I - B'Y_bar B)^-1
     log_det: float  # sum over steps and modes of log det (I - B'Y_bar B / g)
+    Y: Array  # (modes, n_eta, n_eta): what weighs eta at the start of the horizon
 
 
 def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
@@ -39,16 +42,16 @@ def sweep(operator: Operator, g: float, horizon: int) -> Sweep | None:
             return None
         Y_bars[k], inverses[k], Gammas[k], Y = taken.Y_bar, taken.W_inverse, taken.Gamma, taken.Y
         log_det += float(taken.log_det.sum())
-    return Sweep(Y_bars, Gammas, inverses, log_det)
+    return Sweep(Y_bars, Gammas, inverses, log_det, np.asarray(Y))
 
 
 class Slope(NamedTuple):
-    """The derivative of sum trace(V B'Y_bar B) over the steps and modes where V was put in."""
+    """The derivative of sum trace(V B'Y_bar B) over the steps and modes where V was put in, and of trace(X Y_T)."""
 
     K_bar: Array  # (modes, n nx, n nx)
     H_bar: Array  # (modes, n nx, sum ny)
     g: float  # minus the energy of the w that follow what was put in
-    moments: Array  # (T, modes, n_eta + nw, n_eta + nw): of [eta; w], as V started them
+    moments: Array | None  # (T, entries): those of [eta; w] that were asked for, as V and X started them
 
 
 class Inputs:
@@ -61,6 +64,17 @@ class Inputs:
         self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
         widths = [len(node.C) for node in problem.nodes]
         self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Where the error model of any gains may have numbers: where that of such gains as cancel nothing has."""
+        hears = np.array([topology.adjacency != 0.0 for topology in self.problem.topologies])
+        nx, widths = self.problem.nx, [len(node.C) for node in self.problem.nodes]
+        numbers = np.random.default_rng(0)
+        K = np.repeat(np.repeat(hears, nx, axis=1), nx, axis=2)
+        H = np.repeat(np.repeat(hears, nx, axis=1), widths, axis=2)
+        some = (np.where(at, numbers.uniform(1.0, 2.0, at.shape), 0.0) for at in (K, H))
+        return Pattern(error_model(self.problem, *some))
 
     def gains(self, model: ErrorModel, AB: Array, lossy: Array, V: Array | None) -> tuple[Array, Array]:
         """Derivatives by K_bar and H_bar, from those by the rows of e in [A B], by H of `lossy` and by V of the links.
@@ -93,28 +107,38 @@ class Inputs:
             H[s, rows, columns] -= e_j @ C_j.T + w @ bar.D_beta[columns].T
 
 
-def slope(model: ErrorModel, operator: Operator, inputs: Inputs, swept: Sweep, V: Array) -> Slope:
-    """Carry X forward and collect; V (T, modes, nw, nw) has its rows in the order of the sweep."""
+def slope(
+    model: ErrorModel,
+    operator: Operator,
+    inputs: Inputs,
+    swept: Sweep,
+    V: Array,
+    *,
+    X: Array | None = None,
+    entries: Indices | None = None,
+) -> Slope:
+    """Carry X forward and collect; V (T, modes, nw, nw) has its rows in the order of the sweep.
+
+    X (modes, n_eta, n_eta): the covariance of eta at the start, 0 where there is none. `entries`: of the moments
+    (modes, n_eta + nw, n_eta + nw) that are wanted, flat.
+    """
     horizon, modes, size, _ = swept.Y_bar.shape
-    p, links = operator.p, operator.links
-    X = np.zeros((modes, size, size))  # covariance of eta, by mode
-    joint = np.zeros((horizon, modes, size + operator.nw, size + operator.nw))  # of [eta; w]
-    spent = 0.0
+    links, collected, by_V = operator.links, Collected(operator.products), None
+    X = np.zeros((modes, size, size)) if X is None else X
+    joint = np.empty((modes, size + operator.nw, size + operator.nw))  # covariance of [eta; w], by mode
+    moments, spent = None if entries is None else np.empty((horizon, len(entries))), 0.0
     for k in range(horizon - 1, -1, -1):
         GX = swept.Gamma[k] @ X
         GXG = GX @ swept.Gamma[k].swapaxes(1, 2)
         spent += float(np.trace(GXG, axis1=1, axis2=2).sum())
-        joint[k, :, :size, :size], joint[k, :, size:, :size] = X, GX
-        joint[k, :, :size, size:], joint[k, :, size:, size:] = GX.swapaxes(1, 2), GXG + V[k]
-        X = operator.carry(joint[k])
-    by_AB = 2.0 * (swept.Y_bar[:, :, p:] @ (operator.AB @ joint)).sum(axis=0)  # (modes, n nx, n_eta + nw)
-    by_H = np.zeros_like(model.H)
-    if len(operator.lossy):
-        lost = (operator.R @ joint @ operator.R_T) * operator.same
-        roots = np.sqrt(model.alpha[model.owner[operator.lossy]])
-        by_H[:, :, operator.lossy] = 2.0 * (swept.Y_bar[:, :, p:, p:] @ (operator.H @ lost)).sum(axis=0) * roots
-    by_V = None if links is None else links.by_V(swept.Y_bar, joint)
-    return Slope(*inputs.gains(model, by_AB, by_H, by_V), -spent, joint)
+        joint[:, :size, :size], joint[:, size:, :size] = X, GX
+        joint[:, :size, size:], joint[:, size:, size:] = GX.swapaxes(1, 2), GXG + V[k]
+        if moments is not None:
+            moments[k] = joint.reshape(-1)[entries]
+        if links is not None:
+            by_V = links.by_V(swept.Y_bar[k], joint) + (0.0 if by_V is None else by_V)
+        X = operator.carry(joint, collected, swept.Y_bar[k])
+    return Slope(*inputs.gains(model, *collected.full(model), by_V), -spent, moments)
 
 
 class GainSlope(NamedTuple):
@@ -132,12 +156,13 @@ def gain_slope(problem: Problem, K_bar: Array, H_bar: Array, *, horizon: int) ->
     the gains, and the energy of the w that follow, with that of u, is its derivative by g.
     """
     model = error_model(problem, K_bar, H_bar)
-    operator = Operator(model)
+    inputs = Inputs(problem)
+    operator = Operator(model, inputs.pattern)
     g, swept = critical_sweep(operator, horizon)
     k, s, u = critical(swept)
     V = np.zeros_like(swept.W_inverse)
     V[k, s] = np.outer(u, u)
-    slopes = slope(model, operator, Inputs(problem), swept, V)
+    slopes = slope(model, operator, inputs, swept, V)
     gamma = math.sqrt(g)
     scale = 1.0 / ((1.0 - slopes.g) * 2.0 * gamma)
     return GainSlope(gamma, scale * slopes.K_bar, scale * slopes.H_bar)

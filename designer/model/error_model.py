@@ -201,22 +201,28 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     """Eqs. (10)(11) with the reduced state: eta = [x; e_1; ...; e_n], or e alone where x drops out."""
     bar, plant, modes = stacks(problem), problem.plant, len(problem.topologies)
     nx, n, p = problem.nx, problem.n, problem.plant_states
-    rho = problem.delivery
-    delivered = np.kron(rho, np.ones((nx, nx)))  # (n nx, n nx)
-    H = H_bar * np.repeat(np.repeat(rho, nx, axis=0), [len(node.C) for node in problem.nodes], axis=1)
+    H = H_bar
     A = np.zeros((modes, p + n * nx, p + n * nx))
     B = np.zeros((modes, p + n * nx, problem.nw))
-    A[:, p:, p:] = delivered * K_bar - H @ bar.C_beta
-    undelivered = ((1.0 - delivered) * K_bar).reshape(modes, n, nx, n, nx).sum(axis=3)  # what node i makes up for
-    for i in range(n):
-        part = slice(p + i * nx, p + (i + 1) * nx)
-        A[:, part, part] += undelivered[:, i]
+    A[:, p:, p:] = K_bar
+    if problem.links:
+        rho = problem.delivery
+        delivered = np.kron(rho, np.ones((nx, nx)))  # (n nx, n nx)
+        H = H_bar * np.repeat(np.repeat(rho, nx, axis=0), [len(node.C) for node in problem.nodes], axis=1)
+        A[:, p:, p:] *= delivered
+        undelivered = ((1.0 - delivered) * K_bar).reshape(modes, n, nx, n, nx).sum(axis=3)  # what node i makes up for
+        for i in range(n):
+            part = slice(p + i * nx, p + (i + 1) * nx)
+            A[:, part, part] += undelivered[:, i]
+    for i, rows in enumerate(bar.rows):  # H C_bar_beta, which is block diagonal
+        part = slice(i * nx, (i + 1) * nx)
+        A[:, p:, p + i * nx : p + (i + 1) * nx] -= H[:, :, rows] @ bar.C_beta[rows, part]
     B[:, p:] = bar.B - H @ bar.D_beta
     if p:
         A[:, :p, :p], B[:, :p] = plant.A, plant.B
     if not problem.unbiased:
         ones = np.tile(np.eye(nx), (n, 1))  # (n nx, nx): 1 kron I
-        A[:, p:, :p] = bar.A @ ones - K_bar @ ones
+        A[:, p:, :p] = np.tile(plant.A, (n, 1)) - K_bar @ ones
     R = _taken_by_losses(problem, bar, p)
     M = np.hstack([np.zeros((n * problem.nz, p)), bar.M])
     return ErrorModel(
@@ -254,6 +260,8 @@ def _link_terms(problem: Problem, bar: Stacks, K_bar: Array, H_bar: Array, R: Ar
     """
     nx, n, size = problem.nx, problem.n, p + problem.n * problem.nx
     at_w = np.arange(size, size + problem.nw)
+    if not problem.links:
+        return None
     found = [
         (s, i, j, with_loss)
         for s in range(len(problem.topologies))

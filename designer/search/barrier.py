@@ -2,115 +2,76 @@
 
 With y = log g,
 
-    J(K, H, y) = y - mu sum over steps and modes of log det (I - B'Y_bar B / g)
+    J(K, H, y) = y - mu sum over steps and modes of log det (I - B'Y_bar B / g) + kappa tr(X_0 Y_T) / g
 
 is finite exactly where gamma_T^2 < g, and costs one sweep and one covariance: gamma_T itself is never searched for.
-B'Y_bar B is the block of w in `Operator.joint`; docs/theory.md, section 6.
+B'Y_bar B is the block of w in `Operator.joint`. The last term, with X_0 the identity in natural units and kappa small,
+is what an error at the start of the horizon still weighs at its end: without it, what grows slowly costs nothing
+within T. docs/theory.md, section 6.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.gain.sensitivity import Inputs, Slope, Sweep, slope, sweep
-from designer.model.error_model import (
-    ErrorModel,
-    Indices,
-    StackedGains,
-    error_model,
-    measurement_slices,
-    rows_total,
-    stacks,
-)
+from designer.model.error_model import ErrorModel, Indices, error_model
 from designer.model.units import natural_units
 from designer.search import bfgs
+from designer.search.entries import Entries
 from designer.search.starts import node_regression
 
 _DAMPING = 0.1  # added to a Hessian with 1 on its diagonal: only part of the Hessian is known
+_KAPPA = 1e-5  # of the descent: its part of gamma is not seen
+_KAPPA_OF_CENTRE = 1.0  # as if what is left at the end were one step more
+_FLAT = 1e-12  # a curvature in y below this is none
 
 
-class Entries:
-    """The entries of K_bar and H_bar that the topologies allow, as one vector, in natural units.
+class _Node(NamedTuple):
+    """What the gains of one node multiply in one mode."""
 
-    K_ij is in units of x per x and H_ij in units of x per y: a w of unit energy reaches one unit of x. Where gains are
-    unbiased, K_ii is not free: a_ii K_ii = A - sum over j != i of a_ij K_ij.
-    """
+    mean: Array  # (q, c)
+    noises: list[Array]
+    at: Indices  # of its gains in the vector
+    part: slice  # of the moments that are asked for: those of its c entries of [eta; w]
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        nx, columns, modes = problem.nx, measurement_slices(problem), len(problem.topologies)
-        self.K = np.zeros((modes, problem.n * nx, problem.n * nx), dtype=bool)
-        self.H = np.zeros((modes, problem.n * nx, rows_total(problem)), dtype=bool)
-        for s in range(modes):
-            for i in range(problem.n):
-                rows = slice(i * nx, (i + 1) * nx)
-                for j in problem.neighbours(s, i):
-                    self.K[s, rows, j * nx : (j + 1) * nx] = not problem.unbiased or j != i
-                    self.H[s, rows, columns[j]] = True
-        self.units = np.concatenate([np.broadcast_to(units, at.shape)[at] for units, at in self._units()])
 
-    def pack(self, K_bar: Array, H_bar: Array) -> Array:
-        """All K entries, then all H entries."""
-        return np.asarray(np.concatenate([K_bar[self.K], H_bar[self.H]]) / self.units)
+class Blocks:
+    """A block-diagonal symmetric matrix, blocks of one size together; the identity elsewhere."""
 
-    def pack_slope(self, K_bar: Array, H_bar: Array) -> Array:
-        """The derivative by the vector, from those by K_bar and H_bar."""
-        if self.problem.unbiased:
-            K_bar = K_bar - np.tile(self._own(K_bar), (1, 1, self.problem.n))
-        return np.asarray(np.concatenate([K_bar[self.K], H_bar[self.H]]) * self.units)
+    def __init__(self, blocks: list[tuple[Indices, Array]], last: float | None) -> None:
+        sizes = {len(at) for at, _ in blocks}
+        self._alike = [
+            tuple(map(np.array, zip(*((at, B) for at, B in blocks if len(at) == size), strict=True))) for size in sizes
+        ]
+        self._last = last
 
-    def unpack(self, v: Array) -> StackedGains:
-        """The inverse of `pack`, zero elsewhere."""
-        K_bar, H_bar = np.zeros(self.K.shape), np.zeros(self.H.shape)
-        split = np.count_nonzero(self.K)
-        K_bar[self.K], H_bar[self.H] = np.split(v * self.units, [split])
-        if self.problem.unbiased:
-            n, nx = self.problem.n, self.problem.nx
-            own = np.tile(self.problem.plant.A, (n, 1)) - K_bar.reshape(-1, n * nx, n, nx).sum(axis=2)
-            for i in range(n):
-                rows = slice(i * nx, (i + 1) * nx)
-                K_bar[:, rows, rows] = own[:, rows]
-        return K_bar, H_bar
-
-    def of_node(self, s: int, i: int) -> Indices:
-        """Where the vector has [K_ij H_ij] of node i in mode s, row by row."""
-        own = np.zeros((len(self.K), self.problem.n, 1), dtype=bool)
-        own[s, i] = True
-        rows = np.repeat(own, self.problem.nx, axis=1)  # (modes, n nx, 1)
-        of_K = np.broadcast_to(rows, self.K.shape)[self.K]
-        of_H = np.broadcast_to(rows, self.H.shape)[self.H]
-        K, H = np.flatnonzero(of_K), len(of_K) + np.flatnonzero(of_H)
-        return np.hstack([K.reshape(self.problem.nx, -1), H.reshape(self.problem.nx, -1)]).reshape(-1)
-
-    def _units(self) -> list[tuple[Array, NDArray[np.bool_]]]:
-        """What every entry of K_bar and of H_bar is measured in, and which are free."""
-        bar, x = stacks(self.problem), np.tile(natural_units(self.problem).state, self.problem.n)
-        y = np.hypot(np.linalg.norm(bar.C * x, axis=1), np.linalg.norm(bar.D, axis=1))
-        return [(x[:, None] / x, self.K), (x[:, None] / np.where(y > 0.0, y, 1.0), self.H)]
-
-    def _own(self, K_bar: Array) -> Array:
-        """The blocks (i, i), one below the other, (modes, n nx, nx)."""
-        n, nx = self.problem.n, self.problem.nx
-        return np.concatenate([K_bar[:, i * nx : (i + 1) * nx, i * nx : (i + 1) * nx] for i in range(n)], axis=1)
+    def __call__(self, q: Array) -> Array:
+        """Times a vector."""
+        product = q.copy()
+        for at, matrices in self._alike:
+            product[at] = (matrices @ q[at][:, :, None])[:, :, 0]
+        if self._last is not None:
+            product[-1] *= self._last
+        return product
 
 
 class Barrier:
-    """J and what it is made of, for one problem and horizon; x = [v; y] holds the gains' entries and y = log g."""
+    """J and what it is made of, for one problem; x = [v; y] holds the gains' entries and y = log g."""
 
     def __init__(self, problem: Problem, horizon: int) -> None:
         self.problem, self.horizon = problem, horizon
         self.entries, self.inputs = Entries(problem), Inputs(problem)
-        self.heard = {
-            (s, i): (node_regression(problem, s, i), self.entries.of_node(s, i))
-            for s in range(len(problem.topologies))
-            for i in range(problem.n)
-        }
+        units = np.tile(natural_units(problem).state, problem.n + (1 if problem.plant_states else 0))
+        self.size = len(units)
+        self._X = np.broadcast_to(np.diag(units**2), (len(problem.topologies), len(units), len(units)))
+        self._nodes, self._moments = self._heard()
 
     def model(self, v: Array) -> ErrorModel:
         """The error model of the gains v."""
@@ -118,71 +79,96 @@ class Barrier:
 
     def operator(self, v: Array) -> Operator:
         """The same, in the shapes of the recursions."""
-        return Operator(self.model(v))
+        return Operator(self.model(v), self.inputs.pattern)
 
     def descent(self, mu: float) -> bfgs.Function:
-        """J(v, y), whose minimum goes to that of log gamma_T^2 as mu goes to 0."""
+        """J(v, y), whose minimum goes to that of log gamma_T^2 as mu goes to 0, but for kappa."""
 
         def J(x: Array) -> tuple[float, Array]:
-            log_det, gradient = self._log_det(x)
-            gradient = -mu * gradient
+            value, gradient = self._inside(x, _KAPPA / mu)
+            gradient *= mu
             gradient[-1] += 1.0
-            return float(x[-1]) - mu * log_det, gradient
+            return float(x[-1]) + mu * value, gradient
 
         return J
 
     def centre(self, y: float, ridge: float) -> bfgs.Function:
         """The same with g held, and the size of the gains in place of y: -sum of log det + ridge |v|^2 / 2.
 
-        The sum is least where the responses of all horizons together are small: for gains that decay fast.
+        The sum is least where the responses of all horizons together are small: for gains that decay fast. What is
+        left at the end of the horizon is as in J, with much more weight.
         """
 
         def J(v: Array) -> tuple[float, Array]:
-            log_det, gradient = self._log_det(np.append(v, y))
-            return ridge / 2.0 * float(v @ v) - log_det, ridge * v - gradient[:-1]
+            value, gradient = self._inside(np.append(v, y), _KAPPA_OF_CENTRE)
+            return ridge / 2.0 * float(v @ v) + value, ridge * v + gradient[:-1]
 
         return J
 
-    def inverse_hessian(self, x: Array, mu: float, *, ridge: float = 0.0) -> Array:
-        """Where BFGS begins: the inverse of part of the Hessian of J + ridge |v|^2 / 2 by [v; y].
+    def inverse_hessian(self, x: Array, mu: float, *, ridge: float = 0.0) -> bfgs.Map:
+        """Where the search begins: the inverse of part of the Hessian of J + ridge |v|^2 / 2 by [v; y].
 
         The part is what remains if Y_bar and the moments of [eta; w] do not move with the gains, and of that a block
-        for each mode and node: the sum over steps of 2 mu Y_bar (x) E r r', r being what K_ij and H_ij multiply.
-        Other units of x and y scale it as they scale v, so the steps of BFGS do not depend on them.
+        for each mode and node: the sum over steps of 2 mu Y_bar (x) E r r', r being what K_ij and H_ij multiply; and
+        by y the sum of mu tr(W^-2 - W^-1), W = I - B'Y_bar B / g. Other units of x and y scale it as they scale v, so
+        the steps do not depend on them. Without an entry for y, for x = v, where ridge is not 0.
         """
-        inverse, found = np.eye(len(x)), self._swept(x)
+        found = self._swept(x, 0.0, moments=True)
         if found is None:
-            return inverse
+            return Blocks([], None)
         swept, slopes = found
-        for (s, i), (heard, at) in self.heard.items():
-            first, moments = self.inputs.p + i * self.problem.nx, slopes.moments[:, s]
-            rows = slice(first, first + self.problem.nx)
-            gram = heard.mean @ moments @ heard.mean.T + sum(V @ moments @ V.T for V in heard.noises)
-            known = 2.0 * mu * np.einsum("kab,kcd->acbd", swept.Y_bar[:, s, rows, rows], gram, optimize=True)
-            hessian = known.reshape(len(at), -1) * np.outer(self.entries.units[at], self.entries.units[at])
-            hessian += ridge * np.eye(len(at))
+        assert slopes.moments is not None
+        blocks = []
+        for (s, i), node in self._nodes.items():
+            first, c = self.inputs.p + i * self.problem.nx, node.mean.shape[1]
+            rows, moments = slice(first, first + self.problem.nx), slopes.moments[:, node.part].reshape(-1, c, c)
+            gram = node.mean @ moments @ node.mean.T + sum(V @ moments @ V.T for V in node.noises)
+            known = 2.0 * mu * np.tensordot(swept.Y_bar[:, s, rows, rows], gram, (0, 0)).transpose(0, 2, 1, 3)
+            units = self.entries.units[node.at]
+            hessian = known.reshape(len(node.at), -1) * np.outer(units, units)
+            hessian += ridge * np.eye(len(node.at))
             roots = np.sqrt(np.where(hessian.diagonal() > 0.0, hessian.diagonal(), 1.0))
             sizes = np.outer(roots, roots)
-            inverse[np.ix_(at, at)] = np.linalg.inv(hessian / sizes + _DAMPING * np.eye(len(at))) / sizes
-        return inverse
+            blocks.append((node.at, np.linalg.inv(hessian / sizes + _DAMPING * np.eye(len(node.at))) / sizes))
+        W = swept.W_inverse * math.exp(x[-1])
+        curvature = mu * float(np.trace(W @ W - W, axis1=2, axis2=3).sum())
+        return Blocks(blocks, None if ridge else 1.0 / max(curvature, _FLAT))
 
-    def _log_det(self, x: Array) -> tuple[float, Array]:
-        """The sum of log det (I - B'Y_bar B / g) and its gradient in [v; y]; minus infinity where gamma_T^2 >= g."""
-        found = self._swept(x)
+    def _inside(self, x: Array, kappa: float) -> tuple[float, Array]:
+        """-sum of log det (I - B'Y_bar B / g) + kappa tr(X_0 Y_T) / g by [v; y]; infinite where gamma_T^2 >= g."""
+        found = self._swept(x, kappa)
         if found is None:
-            return -math.inf, np.zeros_like(x)
+            return math.inf, np.zeros_like(x)
         swept, slopes = found
         g, count = math.exp(x[-1]), math.prod(swept.W_inverse.shape[:3])
         traces = float(np.trace(swept.W_inverse, axis1=2, axis2=3).sum())
-        down = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
-        return swept.log_det, np.append(-down, g * (traces - slopes.g) - count)
+        late = kappa / g * float(np.vdot(self._X, swept.Y))
+        by_gains = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
+        return late - swept.log_det, np.append(by_gains, count - g * (traces - slopes.g) - late)
 
-    def _swept(self, x: Array) -> tuple[Sweep, Slope] | None:
-        """The sweep at [v; y] and the slopes of -sum of log det; None where gamma_T^2 >= g."""
+    def _swept(self, x: Array, kappa: float, *, moments: bool = False) -> tuple[Sweep, Slope] | None:
+        """The sweep at [v; y] and the slopes of `_inside`; None where gamma_T^2 >= g."""
         v, y = x[:-1], float(x[-1])
         if abs(y) > 300.0 or np.abs(v).max() > 1e50:  # squares overflow
             return None
         model = self.model(v)
-        operator = Operator(model)
+        operator = Operator(model, self.inputs.pattern)
         swept = sweep(operator, math.exp(y), self.horizon)
-        return None if swept is None else (swept, slope(model, operator, self.inputs, swept, swept.W_inverse))
+        if swept is None:
+            return None
+        X, entries = kappa * math.exp(-y) * self._X, self._moments if moments else None
+        return swept, slope(model, operator, self.inputs, swept, swept.W_inverse, X=X, entries=entries)
+
+    def _heard(self) -> tuple[dict[tuple[int, int], _Node], Indices]:
+        """By (s, i), and which moments of [eta; w] they ask for together."""
+        nodes: dict[tuple[int, int], _Node] = {}
+        asked: list[Indices] = []
+        first = 0
+        for (s, i), at in self.entries.nodes.items():
+            heard = node_regression(self.problem, s, i)
+            c, both = heard.columns, heard.t.shape[1]
+            asked.append(((s * both + c[:, None]) * both + c).reshape(-1))
+            part = slice(first, first + len(c) ** 2)
+            nodes[s, i] = _Node(heard.mean[:, c], [V[:, c] for V in heard.noises], at, part)
+            first = part.stop
+        return nodes, np.concatenate(asked)

@@ -1,7 +1,8 @@
-"""BFGS with the weak Wolfe line search of Lewis and Overton, which also suits functions that are not smooth.
+"""L-BFGS with the weak Wolfe line search of Lewis and Overton, which also suits functions that are not smooth.
 
-A. S. Lewis and M. L. Overton, "Nonsmooth optimization via quasi-Newton methods", Mathematical Programming 141, 2013.
-The function may be infinite; the search then stays where it is finite.
+A. S. Lewis and M. L. Overton, "Nonsmooth optimization via quasi-Newton methods", Mathematical Programming 141, 2013;
+the two loops are those of J. Nocedal, "Updating quasi-Newton matrices with limited storage", Mathematics of Computation
+35, 1980. The function may be infinite; the search then stays where it is finite.
 """
 
 from __future__ import annotations
@@ -15,6 +16,18 @@ import numpy as np
 from agent.contract.arrays import Array
 
 Function = Callable[[Array], tuple[float, Array]]  # value and gradient
+Map = Callable[[Array], Array]  # a symmetric positive matrix times a vector
+
+_PAIRS = 100
+
+
+class Pair(NamedTuple):
+    """A step and how the gradient changed along it."""
+
+    s: Array
+    y: Array
+    sy: float
+    scale: float  # s'y / y'(first y)
 
 
 class Point(NamedTuple):
@@ -23,32 +36,43 @@ class Point(NamedTuple):
     x: Array
     value: float
     gradient: Array
-    inverse_hessian: Array
+    first: Map  # an inverse Hessian to begin with
+    scale: float  # of `first`: the largest s'y / y'(first y); the last one may be far too small at a kink
+    pairs: tuple[Pair, ...]  # the oldest first
 
 
-def start(function: Function, x: Array, inverse_hessian: Array) -> Point:
+def start(function: Function, x: Array, first: Map) -> Point:
     """The first point."""
-    return Point(x, *function(x), inverse_hessian)
+    return Point(x, *function(x), first, 1.0, ())
 
 
 def step(function: Function, point: Point) -> Point | None:
-    """One step downhill and the update of the inverse Hessian; None where no step goes down any more."""
-    H, gradient = point.inverse_hessian, point.gradient
-    direction = -(H @ gradient)
-    slope = float(direction @ gradient)
-    if not slope < 0.0:
-        return None
-    found = _weak_wolfe(function, point, direction, slope)
+    """One step downhill; None where no step goes down any more, not even by the first inverse Hessian alone."""
+    direction = _direction(point)
+    slope = float(direction @ point.gradient)
+    found = _weak_wolfe(function, point, direction, slope) if slope < 0.0 else None
     if found is None:
-        return None
-    t, value, gradient_next = found
-    s, y = t * direction, gradient_next - gradient
+        return step(function, point._replace(pairs=(), scale=1.0)) if point.pairs else None
+    t, value, gradient = found
+    s, y, scale, pairs = t * direction, gradient - point.gradient, point.scale, point.pairs
     sy = float(s @ y)
     if sy > 0.0:
-        Hy = H @ y
-        u = s / sy
-        H = H - np.outer(u, Hy) - np.outer(Hy, u) + (1.0 + float(y @ Hy) / sy) * np.outer(u, s)
-    return Point(point.x + s, value, gradient_next, H)
+        pairs = (*pairs[1 - _PAIRS :], Pair(s, y, sy, sy / float(y @ point.first(y))))
+        scale = max(pair.scale for pair in pairs)
+    return Point(point.x + s, value, gradient, point.first, scale, pairs)
+
+
+def _direction(point: Point) -> Array:
+    """Minus the inverse Hessian times the gradient, by two loops over the pairs."""
+    q, shares = point.gradient.copy(), []
+    for s, y, sy, _ in reversed(point.pairs):
+        share = float(s @ q) / sy
+        shares.append(share)
+        q -= share * y
+    q = point.scale * point.first(q)
+    for (s, y, sy, _), share in zip(point.pairs, reversed(shares), strict=True):
+        q += (share - float(y @ q) / sy) * s
+    return np.negative(q)
 
 
 def _weak_wolfe(function: Function, point: Point, direction: Array, slope: float) -> tuple[float, float, Array] | None:

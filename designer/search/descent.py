@@ -2,11 +2,12 @@
 
 gamma_T is not smooth where several modes and directions are critical at once, and at its minimum they are. So the
 minimum is approached from inside, along the path of the minima of designer.search.barrier's J while mu falls; J is
-smooth, and BFGS follows it. docs/theory.md, section 6, has what else was tried.
+smooth, and L-BFGS follows it. docs/theory.md, section 6, has what else was tried.
 
-The last word is the exact gain of the gains found. If it shows that the horizon T was too short, T is doubled. That
-is so for gains that are not mean-square stable too: gamma_T is finite for them, and the longer T is, the more it is
-what grows in the errors that is made small. Where that rate falls no further from T to 2 T, the search ends.
+The last word is the exact gain of the gains found. Where it shows that the horizon T was too short, T is doubled, and
+the search goes on from the last gains that are mean-square stable: gamma_T is finite for others too. Where there are
+none yet, the longer T is, the more it is what grows in the errors that is made small; where that rate falls no further
+from T to 2 T, the search ends.
 """
 
 from __future__ import annotations
@@ -21,21 +22,24 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, exact_gain, horizon_gain
+from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, horizon_gain, horizon_holds, lyapunov
 from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
-from designer.search.barrier import Barrier, Entries
+from designer.search.barrier import Barrier
 
-_COARSE = (3e-2, 9e-3, 3e-3, 9e-4)  # mu: enough to see which start leads lowest
-_FINE = (3e-4, 9e-5, 3e-5, 9e-6)
+_WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
+_NEAR = 3  # weights that are passed over where the start is near
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
 _RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
-_HORIZON = 30
-_LONGEST = 480
-_SHORT = 1e-4  # gamma may exceed gamma_T by so much of itself before T is doubled
+_HORIZON = 20
+_LONGEST = 640
+_NUMBERS = 1e8  # that the Y_bar of all steps may be: 0.8 GB
+_SHORT = 1e-4  # gamma may exceed sqrt(g) by so much of itself, or by this part of mu, before T is doubled
+_SHORT_OF_MU = 0.3
+_LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
-_MOST_STEPS = 1000
+_MOST_STEPS = 300  # for each mu
 _NOTHING = 1e-200  # gamma^2 below this is 0
 
 
@@ -59,13 +63,13 @@ class Candidate(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """Size times the steps that E|eta|^2 takes to decay: what is kept low among gains that guarantee the same."""
-        return self.norm / (1.0 - self.gain.radius) if self.gain.radius < 1.0 else math.inf
+        """What is kept low among gains that guarantee the same."""
+        return _cost(self.norm, self.gain.radius)
 
-    @property
-    def rank(self) -> tuple[float, float]:
-        """The least gain comes first; of gains that are not mean-square stable, what grows least."""
-        return self.gain.high, self.gain.low if self.gain.stable else self.gain.radius
+
+def _cost(norm: float, radius: float) -> float:
+    """Size times the steps that E|eta|^2 takes to decay."""
+    return norm / (1.0 - radius) if radius < 1.0 else math.inf
 
 
 class Descent(NamedTuple):
@@ -73,97 +77,111 @@ class Descent(NamedTuple):
 
     chosen: Candidate
     least: Candidate
-    starts: dict[str, float]  # gamma_T that each start led to, before the best one was taken further
+    start: str
     steps: int
-    interrupted: bool
+    ended: str  # "converged", "interrupted" or "out of time"
+
+
+class Budget:
+    """Seconds for a search, by a clock that may be another than that on the wall."""
+
+    def __init__(self, seconds: float = math.inf, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.seconds, self._clock, self._begun = seconds, clock, clock()
+
+    @property
+    def spent(self) -> float:
+        return self._clock() - self._begun
+
+    def check(self) -> None:
+        """TimeIsUp where it is."""
+        if self.spent >= self.seconds:
+            raise TimeIsUp
+
+
+class TimeIsUp(Exception):
+    """Ends the search, as Ctrl-C does."""
 
 
 def descend(
     problem: Problem,
     starts: Mapping[str, StackedGains],
     *,
+    near: bool = False,
+    budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Descent:
-    """The least exact gain found from the given starts.
+    """The least exact gain found from the best of the given starts; `near`: it is known not to be far from that.
 
-    KeyboardInterrupt ends the search, not the program: the best gains so far are returned.
+    KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
+    returned.
     """
-    search = _Search(problem, progress)
-    interrupted = False
+    search = _Search(problem, Budget() if budget is None else budget, progress)
+    ended = "converged"
     try:
-        search.run(starts)
+        search.run(starts, _WEIGHTS[_NEAR:] if near else _WEIGHTS)
     except KeyboardInterrupt:
-        interrupted = True
-    entries = search.barrier.entries
-    found = [_candidate(entries, *gains) for gains in (*starts.values(), *search.in_hand())]
-    least = min(found, key=lambda candidate: candidate.rank)
-    near = [candidate for candidate in found if candidate.gain.high <= _SLACK * (1.0 + 1e-6) * least.gain.high]
-    chosen = min(near, key=lambda candidate: candidate.cost) if least.gain.stable else least
-    return Descent(chosen, least, search.found, search.steps, interrupted)
-
-
-def _candidate(entries: Entries, K_bar: Array, H_bar: Array) -> Candidate:
-    norm = float(np.linalg.norm(entries.pack(K_bar, H_bar)))
-    return Candidate(K_bar, H_bar, exact_gain(error_model(entries.problem, K_bar, H_bar)), norm)
+        ended = "interrupted"
+    except TimeIsUp:
+        ended = "out of time"
+    try:
+        least, chosen = search.choose(starts)
+    except KeyboardInterrupt:  # the search was over, and this takes seconds
+        least, chosen = search.choose(starts)
+    return Descent(chosen, least, search.start, search.steps, ended)
 
 
 class _Search:
     """The state of one `descend`, so that it is there when the search is interrupted."""
 
-    def __init__(self, problem: Problem, progress: Callable[[Progress], None] | None) -> None:
-        self.problem, self.progress = problem, progress
+    def __init__(self, problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None) -> None:
+        self.problem, self.budget, self.progress = problem, budget, progress
         self.barrier = Barrier(problem, _HORIZON)
-        self.begun, self.steps = time.perf_counter(), 0
-        self.found: dict[str, float] = {}
-        self.best: Array | None = None  # [v; y] with the least y so far
-        self.ends: list[Array] = []  # v of what each start led to
+        self.start, self.steps = "", 0
+        self.best: Array | None = None  # [v; y] with the least y so far on this horizon
+        self.stable: list[Array] = []  # v of the mean-square stable gains that the weights led to
         self.centred: list[Array] = []  # v of ever smaller gains
 
-    def in_hand(self) -> list[StackedGains]:
-        """What each start led to, the best gains so far, and the last of the centred ones and every tenth before it.
+    # the way down
+    def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
+        """The best start by these weights, on longer horizons while T is too short; then to the centre."""
+        found = {name: self._candidate(self.barrier.entries.pack(*gains)) for name, gains in starts.items()}
+        self.start = min(found, key=lambda name: (found[name].gain.high, found[name].gain.radius))
+        v = self.barrier.entries.pack(*starts[self.start])
+        if found[self.start].gain.stable:
+            self.stable.append(v)
+        x, radius, left = self._begin(v), math.inf, list(weights)
+        while left:
+            point = self._follow(left[0], x)
+            x = point.x
+            operator = self.barrier.operator(x[:-1])
+            P, grows = lyapunov(operator)
+            if P is not None:
+                self.stable.append(x[:-1])
+            elif not self._may_be_longer() or not (self.stable or grows < radius * _SLOWER):
+                return
+            elif self.stable:
+                x = np.append(self.stable[-1], x[-1])
+            radius = min(radius, grows)
+            if P is None or self._is_short(operator, x, P, left[0]):
+                self.barrier.horizon, self.best = 2 * self.barrier.horizon, None
+                x = self._begin(x[:-1])
+            else:
+                left.pop(0)
+        self._centre(x)
 
-        The last alone would not do: what grows too slowly to be seen within T steps, centring lets grow.
-        """
-        best = [] if self.best is None else [self.best[:-1]]
-        return [self.barrier.entries.unpack(v) for v in (*self.ends, *best, *self.centred[::-10])]
+    def _may_be_longer(self) -> bool:
+        numbers = 2 * self.barrier.horizon * len(self.problem.topologies) * self.barrier.size**2
+        return 2 * self.barrier.horizon <= _LONGEST and numbers <= _NUMBERS
 
-    def run(self, starts: Mapping[str, StackedGains]) -> None:
-        """Every start by the coarse weights, the best by the fine ones, on longer horizons while T is too short."""
-        coarse: dict[str, bfgs.Point] = {}
-        for name, gains in starts.items():
-            coarse[name] = self._follow(name, _COARSE, self._begin(gains))
-            self.ends.append(coarse[name].x[:-1])
-            self.found[name] = math.exp(coarse[name].x[-1] / 2.0)
-        name = min(self.found, key=lambda start: self.found[start])
-        point = self._lengthen(name, _COARSE[-1:], coarse[name])
-        point = self._follow(name, _FINE, point.x)
-        point = self._lengthen(name, _FINE, point)
-        if self._gain(point.x).stable:
-            self._centre(point)
+    def _is_short(self, operator: Operator, x: Array, P: Array, mu: float) -> bool:
+        """Whether the exact gain of these gains is above sqrt(g)."""
+        above = 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
+        holds, _ = horizon_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
+        return not holds and self._may_be_longer()
 
-    def _lengthen(self, name: str, weights: tuple[float, ...], point: bfgs.Point) -> bfgs.Point:
-        """Double T, and follow again, while T is too short for the gains in hand; the point on the last T."""
-        gain, radius = self._gain(point.x), math.inf
-        while self._horizon_is_short(gain, point.x) and (gain.stable or gain.radius < radius * _SLOWER):
-            radius = gain.radius
-            self.barrier, self.best = Barrier(self.problem, 2 * self.barrier.horizon), None
-            point = self._follow(name, weights, self._begin(self.barrier.entries.unpack(point.x[:-1])))
-            gain = self._gain(point.x)
-        return point
-
-    def _gain(self, x: Array) -> Gain:
-        return exact_gain(error_model(self.problem, *self.barrier.entries.unpack(x[:-1])))
-
-    def _horizon_is_short(self, gain: Gain, x: Array) -> bool:
-        if 2 * self.barrier.horizon > _LONGEST:
-            return False
-        _, g = horizon_gain(self.barrier.operator(x[:-1]), self.barrier.horizon)
-        return gain.high > math.sqrt(g) * (1.0 + _SHORT)
-
-    def _begin(self, gains: StackedGains) -> Array:
+    def _begin(self, v: Array) -> Array:
         """[v; y] with g 10 % above gamma_T^2."""
-        v = self.barrier.entries.pack(*gains)
-        _, g = horizon_gain(self.barrier.operator(v), self.barrier.horizon)
+        _, g = horizon_gain(self.barrier.operator(v), self.barrier.horizon, width=1e-3)
         if g < _NOTHING:
             raise InputError(
                 f"{self.problem.name}: its measurements show z exactly, so the error can be 0 and there is no least "
@@ -171,43 +189,46 @@ class _Search:
             )
         return np.append(v, math.log(1.1 * g))
 
-    def _follow(self, name: str, weights: tuple[float, ...], x: Array) -> bfgs.Point:
-        """The minima of J for falling mu, each only as exactly as the next one needs."""
+    def _follow(self, mu: float, x: Array) -> bfgs.Point:
+        """The minimum of J, only as exactly as the next mu needs it."""
 
         def advance(x: Array) -> None:
             if self.best is None or x[-1] < self.best[-1]:
                 self.best = x
             if self.progress is not None:
-                gamma, seconds = math.exp(x[-1] / 2.0), time.perf_counter() - self.begun
-                self.progress(Progress(name, mu, self.steps, gamma, seconds))
+                gamma = math.exp(x[-1] / 2.0)
+                self.progress(Progress(self.start, mu, self.steps, gamma, self.budget.spent))
 
-        for mu in weights:  # BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
-            inverse_hessian = self.barrier.inverse_hessian(x, mu)
-            point = self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
-            x = point.x
-        return point
+        # L-BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
+        inverse_hessian = self.barrier.inverse_hessian(x, mu)
+        return self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
 
-    def _centre(self, point: bfgs.Point) -> None:
+    def _centre(self, x: Array) -> None:
         """From the least gamma to smaller and faster gains, gamma held below _SLACK times the least."""
-        v, y = point.x[:-1], float(point.x[-1]) + 2.0 * math.log(_SLACK)
+        v, y = x[:-1], float(x[-1]) + 2.0 * math.log(_SLACK)
         ridge = _RIDGE / float(v @ v)
-        inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)[:-1, :-1]
+        inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)
         self._minimise(self.barrier.centre(y, ridge), v, inverse_hessian, self.centred.append, enough=1e-2)
 
     def _minimise(
         self,
         function: bfgs.Function,
         x: Array,
-        inverse_hessian: Array,
+        inverse_hessian: bfgs.Map,
         advance: Callable[[Array], None],
         *,
         enough: float,
     ) -> bfgs.Point:
-        """BFGS until the last few steps together gain less than `enough`."""
-        point = bfgs.start(function, x, inverse_hessian)
+        """L-BFGS until the last few steps together gain less than `enough`."""
+
+        def watched(x: Array) -> tuple[float, Array]:
+            self.budget.check()
+            return function(x)
+
+        point = bfgs.start(watched, x, inverse_hessian)
         values = [point.value]
         while len(values) < _MOST_STEPS:
-            following = bfgs.step(function, point)
+            following = bfgs.step(watched, point)
             if following is None:
                 break
             point = following
@@ -217,3 +238,37 @@ class _Search:
             if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < enough:
                 break
         return point
+
+    # the choice
+    def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
+        """The least gain of all that was found, and the gains to take."""
+        best = [] if self.best is None else [self.best[:-1]]
+        found = [self._candidate(v) for v in (*self.stable[-1:], *best)]
+        if not any(candidate.gain.stable for candidate in found):
+            found += [self._candidate(self.barrier.entries.pack(*gains)) for gains in starts.values()]
+        least = min(found, key=lambda candidate: (candidate.gain.high, candidate.gain.radius))
+        if not least.gain.stable:
+            return least, least
+        near = self._near(least)
+        if not near or min(near)[0] >= least.cost:
+            return least, least
+        return least, self._candidate(near[min(near)])
+
+    def _near(self, least: Candidate) -> dict[tuple[float, int], Array]:
+        """v of the gains that guarantee _SLACK times the least gamma, by their cost.
+
+        They are sought among the last of the centred ones and every tenth before it: the last alone would not do, for
+        what grows too slowly to be seen within T steps, centring lets grow.
+        """
+        near: dict[tuple[float, int], Array] = {}
+        for v in (*self.centred[::-10], *self.stable):
+            operator = self.barrier.operator(v)
+            P, radius = lyapunov(operator)
+            g = (_SLACK * least.gain.high) ** 2
+            if P is not None and horizon_holds(operator, g, _LONG, invariant=InvariantSet(P))[0]:
+                near[_cost(float(np.linalg.norm(v)), radius), len(near)] = v
+        return near
+
+    def _candidate(self, v: Array) -> Candidate:
+        K_bar, H_bar = self.barrier.entries.unpack(v)
+        return Candidate(K_bar, H_bar, exact_gain(error_model(self.problem, K_bar, H_bar)), float(np.linalg.norm(v)))

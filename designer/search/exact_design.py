@@ -12,14 +12,15 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.gain.exact import exact_gain
+from designer.gain.exact import Gain, exact_gain
 from designer.gain.floor import floor
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, Prover
-from designer.search.descent import Descent, Progress, descend
+from designer.search.descent import Budget, Descent, Progress, descend
+from designer.search.effort import refuse_without_memory
 from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
 
 _LMI_STARTS = ("theorem2", "decomposed")
@@ -32,13 +33,17 @@ def design_exact(
     problem: Problem,
     *,
     starts: Mapping[str, StackedGains] | None = None,
+    near: bool = False,
+    budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
-    KeyboardInterrupt ends the search; the best so far is returned.
+    `near`: the starts are near the least gain. KeyboardInterrupt ends the search, and so does the end of the budget,
+    which begins when it is made; the best so far is returned.
     """
     started = time.perf_counter()
+    refuse_without_memory(problem)
     if math.isinf(floor(problem)):
         raise Unattainable(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
@@ -51,7 +56,7 @@ def design_exact(
     if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
-    descent = descend(problem, starts, progress=progress)
+    descent = descend(problem, starts, near=near, budget=budget, progress=progress)
     solved = time.perf_counter()
     chosen = descent.chosen
     if not chosen.gain.stable:
@@ -60,7 +65,10 @@ def design_exact(
             f"{chosen.gain.radius:.6g} in each step, and less than 1 is needed; {_advice(problem)}"
         )
     K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
-    certificate = certify(problem, K, H)
+    try:
+        certificate = certify(problem, K, H, gain=chosen.gain)
+    except KeyboardInterrupt:  # the search is over, and without a proof nothing would be left of it
+        certificate = certify(problem, K, H, gain=chosen.gain)
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
@@ -88,10 +96,9 @@ def design_exact(
 
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
-    starts = {
-        "least variance": least_variance_gains(problem),
-        f"consensus {WEIGHT}": consensus_gains(problem),
-    }
+    starts = {"least variance": least_variance_gains(problem)}
+    if not exact_gain(error_model(problem, *starts["least variance"])).stable:
+        starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None
     from designer.lmi import decomposed, theorem2  # cvxpy takes seconds to import
@@ -107,9 +114,9 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     return starts, solution.gamma
 
 
-def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
-    """gamma just above the exact gain of any gains of (5), proved; or Unattainable."""
-    gain = exact_gain(error_model(problem, *stacked_links(problem, K, H)))
+def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | None = None) -> Certificate:
+    """gamma just above the exact gain of any gains of (5), proved; or Unattainable. `gain`: where it is known."""
+    gain = exact_gain(error_model(problem, *stacked_links(problem, K, H))) if gain is None else gain
     if not gain.stable:
         raise Unattainable(
             f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
@@ -158,11 +165,10 @@ def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *
 
 
 def _status(descent: Descent) -> str:
-    """What was found from where, and what the chosen gains trade for their size and decay."""
-    found = ", ".join(f"{name} {gamma:.6g}" for name, gamma in descent.starts.items())
+    """How the search ended and where it began, and what the chosen gains trade for their size and decay."""
     chosen, least = descent.chosen, descent.least
     return (
-        f"{'interrupted' if descent.interrupted else 'converged'}; starts led to {found or 'nothing yet'}; "
+        f"{descent.ended}; from {descent.start or 'the start'}; "
         f"least {least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
         f"chosen {chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
     )

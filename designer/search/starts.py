@@ -12,14 +12,16 @@ Where that covariance settles, the error system is mean-square stable, so these 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator
-from designer.model.error_model import StackedGains, error_model, measurement_slices, rows_total
+from designer.gain.sensitivity import Inputs
+from designer.model.error_model import Indices, StackedGains, error_model, measurement_slices, rows_total
+from designer.search.entries import Entries
 
 WEIGHT = 0.4  # of the neighbours' estimates together
 _MOST_STEPS = 1000
@@ -92,30 +94,23 @@ def _plant_covariance(problem: Problem) -> Array:
 
 def least_variance_gains(problem: Problem) -> StackedGains:
     """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
-    modes, nx, columns = len(problem.topologies), problem.nx, measurement_slices(problem)
-    regressions = {(s, i): node_regression(problem, s, i) for s in range(modes) for i in range(problem.n)}
+    modes, entries, pattern = len(problem.topologies), Entries(problem), Inputs(problem).pattern
+    batches = _batches(problem, entries)
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
     occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
-    K_bar = np.zeros((modes, problem.n * nx, problem.n * nx))
-    H_bar = np.zeros((modes, problem.n * nx, rows_total(problem)))
-    size = problem.plant_states + problem.n * nx
+    v = np.zeros(len(entries.units))
+    size = problem.plant_states + problem.n * problem.nx
     fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
     X = fresh
     joint = np.zeros((modes, size + problem.nw, size + problem.nw))
     joint[:, size:, size:] = occupied[:, None, None] * np.eye(problem.nw)
     for _ in range(_STEPS_OF_NETWORK):
         joint[:, :size, :size] = X
-        for (s, i), regression in regressions.items():
-            rows, best = slice(i * nx, (i + 1) * nx), regression.best(joint[s])
-            for j, part in regression.K.items():
-                K_bar[s, rows, j * nx : (j + 1) * nx] = best[:, part]
-            for j, part in regression.H.items():
-                H_bar[s, rows, columns[j]] = best[:, part]
-            if problem.unbiased:
-                others = sum((best[:, part] for part in regression.K.values()), np.zeros((nx, nx)))
-                K_bar[s, rows, rows] = problem.plant.A - others
-        operator = Operator(error_model(problem, K_bar, H_bar))
+        for batch in batches:
+            v[batch.at] = batch.best(joint)
+        K_bar, H_bar = entries.unpack(v / entries.units)
+        operator = Operator(error_model(problem, K_bar, H_bar), pattern)
         operator.transition = chain
         X_next = operator.carry(joint) + fresh
         change = np.abs(X_next - X).max()
@@ -123,6 +118,42 @@ def least_variance_gains(problem: Problem) -> StackedGains:
         if change <= _SETTLED_NETWORK * np.abs(X).max() or np.abs(X).max() > _BOUNDLESS:
             break
     return K_bar, H_bar
+
+
+class _Batch(NamedTuple):
+    """Regressions of one shape, m of them, each over the c entries of [eta; w] that it depends on."""
+
+    at: Indices  # (m, nx q): where the vector of all gains has [K H]
+    moments: Indices  # (m, c, c): of the moments of [eta; w] in all modes, flat
+    t: Array  # (m, nx, c)
+    mean: Array  # (m, q, c)
+    noises: Array  # (m, noises, q, c)
+
+    def best(self, joint: Array) -> Array:
+        """[K H] = E[t r'] E[r r']^-1, (m, nx q), where [eta; w] has the covariance `joint` in each mode."""
+        cov = joint.reshape(-1)[self.moments]
+        mean_T = self.mean.swapaxes(1, 2)
+        gram = self.mean @ cov @ mean_T
+        gram += (self.noises @ cov[:, None] @ self.noises.swapaxes(2, 3)).sum(axis=1)
+        sizes = np.diagonal(gram, axis1=1, axis2=2)
+        scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+        inverse = np.linalg.pinv(gram * scale[:, None] * scale[:, :, None], rcond=1e-10, hermitian=True)
+        best = (self.t @ cov @ mean_T * scale[:, None]) @ inverse * scale[:, None]
+        return np.asarray(best.reshape(self.at.shape))
+
+
+def _batches(problem: Problem, entries: Entries) -> list[_Batch]:
+    """The regressions of all nodes in all modes, those of one shape together."""
+    found: dict[tuple[int, ...], list[tuple[Any, ...]]] = {}
+    for (s, i), at in entries.nodes.items():
+        regression = node_regression(problem, s, i)
+        c, rows = regression.columns, np.array([s])
+        both = regression.t.shape[1]
+        moments = (rows[:, None] * both + c[:, None]) * both + c
+        noises: Array = np.array([V[:, c] for V in regression.noises]).reshape(-1, len(regression.mean), len(c))
+        parts: tuple[Any, ...] = (at, moments, regression.t[:, c], regression.mean[:, c], noises)
+        found.setdefault(tuple(size for part in parts for size in part.shape), []).append(parts)
+    return [_Batch(*map(np.array, zip(*alike, strict=True))) for alike in found.values()]
 
 
 class Regression(NamedTuple):
@@ -135,16 +166,11 @@ class Regression(NamedTuple):
     t: Array  # (nx, n_eta + nw)
     mean: Array  # (regressors, n_eta + nw)
     noises: list[Array]  # what chance adds to the mean, each times something of variance 1
-    K: dict[int, slice]  # where a_j stands
-    H: dict[int, slice]  # where phi_ij nu_j stands
 
-    def best(self, joint: Array) -> Array:
-        """[K H] = E[t r'] E[r r']^-1, (nx, regressors), where [eta; w] has the covariance `joint`."""
-        noise = sum((V @ joint @ V.T for V in self.noises), np.zeros((len(self.mean), len(self.mean))))
-        gram = self.mean @ joint @ self.mean.T + noise
-        scale = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
-        inverse = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True)
-        return np.asarray((self.t @ joint @ self.mean.T * scale) @ inverse * scale)
+    @property
+    def columns(self) -> Indices:
+        """The entries of [eta; w] that it depends on."""
+        return np.flatnonzero(np.vstack([self.t, self.mean, *self.noises]).any(axis=0))
 
 
 def node_regression(problem: Problem, s: int, i: int) -> Regression:
@@ -178,4 +204,4 @@ def node_regression(problem: Problem, s: int, i: int) -> Regression:
         mean += rho * sent
         noises += [np.sqrt(rho * (1.0 - rho)) * sent] if rho < 1.0 else []
         noises += [np.sqrt(rho * beta * (1.0 - beta)) * lost] if beta < 1.0 else []
-    return Regression(t, mean, noises, K, H)
+    return Regression(t, mean, noises)

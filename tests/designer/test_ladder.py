@@ -7,11 +7,12 @@ from itertools import pairwise
 
 import pytest
 
+from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.ladder import Ladder, ladder_of, percent, rounded_up
 from designer.problems import find, names
-from designer.search.effort import LONGEST, default_method, in_words, seconds_of_exact
+from designer.search.effort import BUDGET, default_method, in_words, refuse_without_memory, seconds_of_exact
 from designer.synthesis import design
 
 
@@ -81,18 +82,29 @@ def test_percentages() -> None:
     assert [percent(part) for part in (-0.2954, 0.031, 1e-9, -1e-9)] == ["-29.5 %", "+3.1 %", "0.0 %", "0.0 %"]
 
 
-def test_the_default_is_exact_up_to_ten_minutes() -> None:
-    """Every built-in problem is small; a hundred nodes are not; many designs of one problem are not either."""
+def test_the_default_is_exact_up_to_200_nodes() -> None:
+    """And for many designs of one problem, where they take ten minutes together at most."""
     assert {name: default_method(find(name)) for name in names()} == dict.fromkeys(names(), "exact")
-    large = banded(100)
-    assert seconds_of_exact(large) > LONGEST
-    assert default_method(large) == "decomposed"
-    assert default_method(find("zhu2020-lossy"), designs=1000.0) == "decomposed"
+    assert [default_method(banded(n)) for n in (200, 201)] == ["exact", "decomposed"]
+    lossy = find("zhu2020-lossy")
+    many = BUDGET / seconds_of_exact(lossy)
+    assert [default_method(lossy, designs=part * many) for part in (0.9, 1.1)] == ["exact", "decomposed"]
 
 
-def test_the_estimate_grows_with_the_network() -> None:
-    seconds = [seconds_of_exact(banded(n)) for n in (4, 8, 16, 32)]
-    assert all(3.0 < later / earlier < 8.0 for earlier, later in pairwise(seconds))
+def test_the_estimate_grows_with_the_square_of_large_networks() -> None:
+    seconds = [seconds_of_exact(banded(n)) for n in (4, 8, 16, 32, 64, 128)]
+    ratios = [later / earlier for earlier, later in pairwise(seconds)]
+    assert ratios == sorted(ratios)
+    assert 3.5 < ratios[-1] < 4.0
+
+
+def test_memory_that_does_not_suffice_is_said_before() -> None:
+    problem = banded(50)
+    refuse_without_memory(problem, free=1e9)
+    with pytest.raises(
+        InputError, match=r"needs about 0\.2 GB of memory for 50 nodes and 4 modes, and 0\.1 GB are free"
+    ):
+        refuse_without_memory(problem, free=1e8)
 
 
 def test_seconds_in_words() -> None:

@@ -108,6 +108,10 @@ def test_the_price_of_parts_by_lmi() -> None:
     alone = design(without_node(problem, "left"), method="decomposed")
     assert row.gamma == pytest.approx(alone.certificate.gamma, rel=1e-6)
     assert rounded_up(row.gamma) in price_text(table)
+    whole, rest = design(problem, method="decomposed"), without_link(problem, "left", "right")
+    kept = next(row.kept for row in table.rows if row.name == "left:right")
+    assert kept == pytest.approx(exact_gain(error_model(rest, *what_if._gains_left(whole, rest))).high, rel=1e-6)
+    assert rounded_up(kept) in price_text(table)
 
 
 def test_a_node_is_priced_against_what_the_others_had() -> None:

@@ -57,12 +57,27 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_the_default_of_a_large_problem(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where exact would take too long the decomposed LMI is solved, and one sentence says so."""
-    monkeypatch.setattr(effort, "LONGEST", 0.0)
+    """Where there are too many nodes the decomposed LMI is solved, and one sentence says so."""
+    monkeypatch.setattr(effort, "MOST_NODES", 1)
     assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["method"] == "decomposed"
-    assert printed.err == "method decomposed: exact would take about 2 seconds here; --method exact asks for it\n"
+    assert printed.err == "method decomposed: there are more than 1 nodes; --method exact asks for it\n"
+
+
+def test_what_there_is_when_time_is_over_is_certified(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A budget too short for one step leaves the gains that the search would have started from, and says so."""
+    assert run("design", "two-nodes", "-o", "gains.json", "--budget", "0.000001s") == 0
+    assert capsys.readouterr().err == "the search was out of time after 0 steps; --budget gives it more\n"
+    assert Gains.load(Path("gains.json")).solver.status.startswith("out of time; from ")
+    assert run("verify", "gains.json") == 0
+
+
+@pytest.mark.parametrize("text", ["0", "10 min", "1d", "-1s", "min"])
+def test_a_budget_is_a_time(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        run("design", "two-nodes", f"--budget={text}")
+    assert f'"{text}" is no time; write 90s, 10min or 2h' in capsys.readouterr().err
 
 
 def test_what_if(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

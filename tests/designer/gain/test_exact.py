@@ -20,7 +20,7 @@ from designer.lmi.back_off import inequality_17
 from designer.model.error_model import ErrorModel, error_model, link_gains, paper_error_model, realised
 from designer.problems import find
 from designer.proof.prover import Prover
-from designer.search.barrier import Entries
+from designer.search.entries import Entries
 from designer.search.starts import consensus_gains, least_variance_gains
 
 Case = tuple[Problem, Array, Array]

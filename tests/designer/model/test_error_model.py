@@ -13,6 +13,7 @@ from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.gain.exact import Operator
+from designer.gain.products import Collected
 from designer.model.error_model import error_model, link_gains, paper_error_model, realised, stacks, step
 from designer.search.starts import consensus_gains
 
@@ -210,33 +211,48 @@ def test_the_mean_over_all_losses_is_what_the_operator_says(real: Network) -> No
         np.testing.assert_allclose(joint[s], expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
 
 
-def zeros_may_be_left_out(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`Operator.joint` is the same with sparse and with full matrices, wherever the zeros are."""
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_the_zeros_of_large_networks_may_be_left_out(
+    network: Network, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`Operator.joint`, its adjoint and its derivative are the same by one group of rows and by many."""
+    zeros_may_be_left_out(network, rows, monkeypatch)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_and_of_real_networks_too(real: Network, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    zeros_may_be_left_out(real, rows, monkeypatch)
+
+
+def zeros_may_be_left_out(network: Network, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever the zeros are."""
     model, rng = error_model(*network), np.random.default_rng(6)
-    H, R = (np.where(rng.uniform(size=full.shape) < 0.5, 0.0, full) for full in (model.H, model.R))
-    model = replace(model, H=H, R=R)
-    factor = rng.normal(size=(model.modes, model.size, model.size))
-    Y_bar, joints = factor @ factor.swapaxes(1, 2), []
-    for share in (0.0, 2.0):
-        monkeypatch.setattr("designer.gain.exact._SPARSE", share)
+    A, H, R = (np.where(rng.uniform(size=full.shape) < 0.5, 0.0, full) for full in (model.A, model.H, model.R))
+    model = replace(model, A=A, H=H, R=R)
+    both = model.size + model.nw
+    Y, X = (f @ f.swapaxes(1, 2) for f in (rng.normal(size=(model.modes, k, k)) for k in (model.size, both)))
+    found = []
+    for small in (10_000, 0):
+        monkeypatch.setattr("designer.gain.products._SMALL", small)
+        monkeypatch.setattr("designer.gain.products._SPARSE", 2.0)
+        monkeypatch.setattr("designer.gain.products._WIDE", 0.8)
+        monkeypatch.setattr("designer.gain.products._ROWS", rows)
         operator = Operator(model)
-        assert (operator.sparse is None) == (share == 0.0)
-        joints.append(operator.joint(Y_bar))
-    np.testing.assert_allclose(*joints, rtol=1e-11, atol=1e-11 * np.abs(joints[0]).max())
+        assert (len(operator.products.pattern.rows) == 1) == (small > 0)
+        collected = Collected(operator.products)
+        joint, carried = operator.joint(Y), operator.carry(X, collected, Y)
+        by_AB, by_H = collected.full(model)
+        kept = np.concatenate([model.A, model.B], axis=2).any(axis=0)[model.plant_states :]
+        found.append((joint, carried, by_AB * kept, by_H * (model.H != 0.0)))
+    for one, many in zip(*found, strict=True):
+        np.testing.assert_allclose(one, many, rtol=1e-11, atol=1e-11 * np.abs(one).max())
 
 
-def test_the_zeros_of_large_networks_may_be_left_out(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    zeros_may_be_left_out(network, monkeypatch)
-
-
-def test_and_of_real_networks_too(real: Network, monkeypatch: pytest.MonkeyPatch) -> None:
-    zeros_may_be_left_out(real, monkeypatch)
-
-
-def test_networks_of_40_nodes_are_sparse_and_those_of_4_are_not() -> None:
-    for n, sparse in ((4, False), (40, True)):
+def test_networks_of_40_nodes_have_many_groups_of_rows_and_those_of_4_have_one() -> None:
+    for n, many in ((4, False), (40, True)):
         problem = banded(n, seed=1)
-        assert (Operator(error_model(problem, *consensus_gains(problem))).sparse is not None) == sparse
+        products = Operator(error_model(problem, *consensus_gains(problem))).products
+        assert (len(products.pattern.rows) > 1) == many
 
 
 def test_the_noises_have_mean_0_and_the_matrices_that_the_model_names(real: Network) -> None:

@@ -11,8 +11,11 @@ from networks import random_gains, random_problem, real_networks
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
+from designer.gain.sensitivity import slope, sweep
 from designer.model.error_model import error_model
-from designer.search.barrier import Barrier, Entries
+from designer.model.units import natural_units
+from designer.search.barrier import Barrier
+from designer.search.entries import Entries
 from designer.search.starts import consensus_gains, least_variance_gains
 
 PROBLEMS = [random_problem(1), random_problem(2), *real_networks(3).values()]
@@ -55,25 +58,57 @@ def test_bfgs_begins_with_the_curvature_of_what_each_node_chooses(problem: Probl
     gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
     v = barrier.entries.pack(*gains)
     x = np.append(v, math.log(2.0 * exact_gain(error_model(problem, *gains)).high ** 2))
-    found = barrier._swept(x)
+    operator = barrier.operator(v)
+    swept = sweep(operator, math.exp(x[-1]), 9)
+    assert swept is not None
+    everything = np.arange(operator.joint(swept.Y_bar[0]).size)
+    found = slope(barrier.model(v), operator, barrier.inputs, swept, swept.W_inverse, entries=everything).moments
     assert found is not None
-    swept, slopes = found
+    moments = found.reshape(9, len(problem.topologies), *2 * [barrier.size + problem.nw])
 
     def held(v: Array) -> float:
         operator = barrier.operator(v)
-        pairs = zip(swept.Y_bar, slopes.moments, strict=True)
-        return mu * sum(float((operator.joint(Y_bar) * moments).sum()) for Y_bar, moments in pairs)
+        pairs = zip(swept.Y_bar, moments, strict=True)
+        return mu * sum(float((operator.joint(Y_bar) * of_step).sum()) for Y_bar, of_step in pairs)
 
     inverse = barrier.inverse_hessian(x, mu, ridge=0.7)
     for s in range(len(problem.topologies)):
         for i in range(problem.n):
-            at = barrier.entries.of_node(s, i)
-            damped = np.linalg.inv(inverse[np.ix_(at, at)])
+            at = barrier.entries.nodes[s, i]
+            damped = np.linalg.inv([inverse(unit)[at] for unit in np.eye(len(x))[at]])
             hessian = damped - np.diag(damped.diagonal() * 0.1 / 1.1)
             direction = np.zeros(len(v))
             direction[at] = rng.normal(size=len(at))
             second = held(v + direction) - 2.0 * held(v) + held(v - direction) + 0.7 * float(direction @ direction)
             assert float(direction[at] @ hessian @ direction[at]) == pytest.approx(second, rel=1e-6)
+
+
+def test_the_curvature_by_y_is_that_of_the_barrier_with_Y_bar_held() -> None:
+    """Second differences of -sum log det (I - S_ww e^-y), for the S_ww of one sweep."""
+    problem, h = random_problem(2), 1e-3
+    barrier, gains = Barrier(problem, 9), random_gains(problem, 1, size=0.1)
+    y = math.log(2.0 * exact_gain(error_model(problem, *gains)).high ** 2)
+    swept = sweep(barrier.operator(barrier.entries.pack(*gains)), math.exp(y), 9)
+    assert swept is not None
+    S_ww = math.exp(y) * np.eye(problem.nw) - np.linalg.inv(swept.W_inverse)
+    values = [-np.linalg.slogdet(np.eye(problem.nw) - S_ww * math.exp(-y - step))[1].sum() for step in (-h, 0.0, h)]
+    x = np.append(barrier.entries.pack(*gains), y)
+    last = barrier.inverse_hessian(x, 0.03)(np.ones_like(x))[-1]
+    assert 1.0 / last == pytest.approx(0.03 * (values[0] - 2.0 * values[1] + values[2]) / h**2, rel=1e-3)
+
+
+def test_what_grows_slowly_costs_something() -> None:
+    """kappa tr(X_0 Y_T) / g, and nothing else, is what J has more than with kappa = 0."""
+    problem = random_problem(2)
+    barrier, gains = Barrier(problem, 5), random_gains(problem, 1, size=0.1)
+    y = math.log(2.0 * exact_gain(error_model(problem, *gains)).high ** 2)
+    x = np.append(barrier.entries.pack(*gains), y)
+    swept = sweep(barrier.operator(x[:-1]), math.exp(y), 5)
+    assert swept is not None
+    units = np.tile(natural_units(problem).state, problem.n + 1)
+    late = sum(float(units**2 @ Y.diagonal()) for Y in swept.Y) / math.exp(y)
+    assert barrier._inside(x, 2.0)[0] - barrier._inside(x, 0.0)[0] == pytest.approx(2.0 * late, rel=1e-9)
+    assert late > 0.0
 
 
 def test_entries_are_those_that_the_topologies_allow() -> None:
@@ -93,7 +128,7 @@ def test_the_entries_of_a_node_are_its_rows_and_all_are_somebodys(kind: str) -> 
     entries, nx, seen = Entries(problem), problem.nx, []
     for s in range(len(problem.topologies)):
         for i in range(problem.n):
-            at = entries.of_node(s, i)
+            at = entries.nodes[s, i]
             seen += at.tolist()
             v = np.zeros(len(entries.units))
             v[at] = 1.0

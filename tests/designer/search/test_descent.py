@@ -7,6 +7,10 @@ and takes few.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import partial
+from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,13 +18,14 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from benchmarks.design import banded
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
-from designer.model.error_model import error_model, link_gains, stacked_links
+from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
 from designer.problems import find
 from designer.search import descent
-from designer.search.descent import Descent, Progress, descend
+from designer.search.descent import Budget, Descent, Progress, descend
 from designer.search.starts import consensus_gains, least_variance_gains
 
 
@@ -29,6 +34,17 @@ def ideal() -> Descent:
     """The paper's first example, from gains made without any solver."""
     problem = find("zhu2020-ideal")
     return descend(problem, {"least variance": least_variance_gains(problem)})
+
+
+def alone(problem: Problem, starts: Mapping[str, StackedGains]) -> dict[str, Descent]:
+    """Where each start leads."""
+    return {name: descend(problem, {name: gains}) for name, gains in starts.items()}
+
+
+def agree(each: Mapping[str, Descent]) -> bool:
+    """Within 0.5 %."""
+    found = [descent.least.gain.high for descent in each.values()]
+    return max(found) <= 1.005 * min(found)
 
 
 def in_other_units(problem: Problem, x: Array, y: Array) -> Problem:
@@ -43,8 +59,8 @@ def in_other_units(problem: Problem, x: Array, y: Array) -> Problem:
 
 @pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
 def test_the_search_does_not_depend_on_units(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Powers of 2 change no rounding: the same steps, and the same gamma from every start, bit for bit."""
-    for name, value in {"_COARSE": (3e-2, 9e-3), "_FINE": (3e-3,), "_HORIZON": 10, "_LONGEST": 10}.items():
+    """Powers of 2 change no rounding: the same start, steps and gamma, bit for bit."""
+    for name, value in {"_WEIGHTS": descent._WEIGHTS[:3], "_HORIZON": 10, "_LONGEST": 10}.items():
         monkeypatch.setattr(descent, name, value)
     problem = real_networks(6, n=2)[kind]
     starts = {"consensus": consensus_gains(problem, weight=0.4), "least variance": least_variance_gains(problem)}
@@ -53,48 +69,49 @@ def test_the_search_does_not_depend_on_units(kind: str, monkeypatch: pytest.Monk
     others = {name: (K * each / each[:, None], H * y / each[:, None]) for name, (K, H) in starts.items()}
     found, other = descend(problem, starts), descend(in_other_units(problem, x, y), others)
     assert other.steps == found.steps
-    assert other.starts == found.starts
+    assert other.start == found.start
     assert other.least.gain.high == pytest.approx(found.least.gain.high, rel=1e-6)
     assert other.least.norm == found.least.norm
     np.testing.assert_array_equal(other.least.K_bar * each[:, None] / each, found.least.K_bar)
 
 
 def test_starts_agree_on_the_pendulum_whose_states_are_of_different_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(descent, "_FINE", (3e-4,))
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:5])
     monkeypatch.setattr(descent, "_HORIZON", 10)
     problem = find("inverted-pendulum")
     starts = {"consensus": consensus_gains(problem), "least variance": least_variance_gains(problem)}
-    found = descend(problem, starts)
-    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+    assert agree(alone(problem, starts))
 
 
-def test_gains_are_chosen_on_the_way_where_the_smallest_are_not_stable(ideal: Descent) -> None:
-    """In the paper's first example centring ends at errors that grow, too slowly for the horizon."""
+def test_gains_are_chosen_that_are_smaller_or_faster(ideal: Descent) -> None:
+    """In the paper's first example the least gamma is that of large gains whose errors decay slowly."""
     assert ideal.chosen.gain.high <= 1.00101 * ideal.least.gain.high
-    assert ideal.chosen.cost < 0.5 * ideal.least.cost
+    assert ideal.chosen.cost < 0.2 * ideal.least.cost
 
 
 def test_any_start_leads_to_the_answer_that_is_known() -> None:
     """two-nodes has the gain sqrt 2 at best; the chosen gains are within 0.1 % of the least found."""
     problem = find("two-nodes")
     starts = {str(seed): random_gains(problem, seed, size=0.1) for seed in range(2)}
-    found = descend(problem, starts)
+    each = alone(problem, starts)
+    found = each["0"]
     assert math.sqrt(2.0) <= found.least.gain.high <= math.sqrt(2.0) * (1.0 + 1e-4)
     assert found.chosen.gain.high <= found.least.gain.high * 1.00101
     assert found.chosen.cost <= found.least.cost
-    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+    assert agree(each)
 
 
 @pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
 def test_starts_agree_with_what_real_networks_need(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """From gains that share nothing but their sparsity, within 0.5 %; the result is above the floor and stable."""
-    monkeypatch.setattr(descent, "_FINE", (3e-4,))
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:5])
     monkeypatch.setattr(descent, "_HORIZON", 15)
     problem = real_networks(6, n=2)[kind]
     starts = {"consensus": consensus_gains(problem, weight=0.4), "least variance": least_variance_gains(problem)}
-    found = descend(problem, starts)
+    each = alone(problem, starts)
+    found = each["consensus"]
     assert found.chosen.gain.stable
-    assert max(found.starts.values()) <= 1.005 * min(found.starts.values())
+    assert agree(each)
     before = min(exact_gain(error_model(problem, *gains)).high for gains in starts.values())
     assert floor(problem) <= found.least.gain.high < before
     K, H = link_gains(problem, found.chosen.K_bar, found.chosen.H_bar)
@@ -103,8 +120,7 @@ def test_starts_agree_with_what_real_networks_need(kind: str, monkeypatch: pytes
 
 def test_a_start_that_is_not_mean_square_stable_leads_to_gains_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """The barrier is finite over 30 steps, however fast the errors grow. The coarse weights show it."""
-    monkeypatch.setattr(descent, "_COARSE", (3e-2, 9e-3))
-    monkeypatch.setattr(descent, "_FINE", (3e-3,))
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:3])
     problem = real_network(random_problem(5, n=2), seen=True, delivery=0.6, unbiased=True, radius=1.3)
     start = consensus_gains(problem, weight=0.9)
     assert not exact_gain(error_model(problem, *start)).stable
@@ -131,7 +147,56 @@ def test_an_interrupted_search_keeps_the_best_so_far() -> None:
             raise KeyboardInterrupt
 
     found = descend(problem, {"consensus": consensus_gains(problem, weight=0.2)}, progress=interrupt)
-    assert found.interrupted
+    assert found.ended == "interrupted"
     assert found.steps == 25
     assert found.chosen.gain.stable
     assert found.least.gain.high <= min(progress.gamma for progress in reported) * 1.01
+
+
+@pytest.mark.parametrize("evaluations", [0, 1, 60])
+def test_what_there_is_is_kept_when_time_is_over(evaluations: int) -> None:
+    """By a clock that counts how often it is asked: no worse than the start, and better once there are steps."""
+    problem = find("two-nodes")
+    start = random_gains(problem, 0, size=0.1)
+    before = exact_gain(error_model(problem, *start))
+    asked = count(-1.0)  # 0 when the budget begins
+    found = descend(problem, {"random": start}, budget=Budget(evaluations, clock=lambda: next(asked)))
+    assert found.ended == "out of time"
+    assert before.stable
+    assert (found.steps == 0) == (evaluations < 2)
+    assert found.chosen.gain.high < 0.9 * before.high if found.steps else found.chosen.gain.high == before.high
+
+
+def test_a_second_thought_while_the_choice_is_made_does_not_lose_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C then comes once more than the search needs it, and the gains are there all the same."""
+    problem, pressed = find("two-nodes"), []
+
+    def near(self: Any, least: Any) -> dict[tuple[float, int], Array]:
+        if not pressed:
+            pressed.append(True)
+            raise KeyboardInterrupt
+        return {}
+
+    monkeypatch.setattr(descent._Search, "_near", near)
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:2])
+    found = descend(problem, {"least variance": least_variance_gains(problem)})
+    assert pressed
+    assert found.chosen.gain.stable
+
+
+def test_a_near_start_passes_over_the_first_weights() -> None:
+    """And ends where the whole way ends."""
+    problem = find("two-nodes")
+    whole = descend(problem, {"least variance": least_variance_gains(problem)})
+    again = descend(problem, {"whole": (whole.least.K_bar, whole.least.H_bar)}, near=True)
+    assert again.steps < whole.steps
+    assert again.least.gain.high <= whole.least.gain.high * (1.0 + 1e-4)
+
+
+def test_a_large_network_goes_below_least_variance_within_a_few_steps() -> None:
+    """40 nodes are in several groups of rows."""
+    problem = banded(40)
+    start = least_variance_gains(problem)
+    budget = Budget(40.0, clock=partial(next, count(-1.0)))
+    found = descend(problem, {"least variance": start}, budget=budget)
+    assert found.chosen.gain.high < 0.95 * exact_gain(error_model(problem, *start)).high

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from agent.contract.errors import Unattainable
@@ -12,7 +14,9 @@ from designer.gain.floor import floor
 from designer.model.error_model import error_model
 from designer.problems import find
 from designer.proof.certificate import verify
-from designer.search import descent
+from designer.proof.findings import Verdict
+from designer.search import descent, exact_design
+from designer.search.descent import Budget
 from designer.search.exact_design import design_exact
 from designer.search.starts import least_variance_gains
 from designer.synthesis import design
@@ -37,7 +41,7 @@ def test_above_the_critical_arrival_probability_there_are_gains_and_below_there_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The refusal says how far the best gains are from stable: a^2 (1 - beta)."""
-    for name, value in {"_FINE": (3e-4,), "_HORIZON": 10, "_LONGEST": 20}.items():
+    for name, value in {"_WEIGHTS": descent._WEIGHTS[:5], "_HORIZON": 10, "_LONGEST": 20}.items():
         monkeypatch.setattr(descent, name, value)
     assert exact_gain(error_model(alone(0.8), *least_variance_gains(alone(0.8)))).stable
     with pytest.raises(Unattainable, match=r"^no mean-square stable gains .* multiply E\|error\|\^2 by 1\.2 "):
@@ -56,18 +60,33 @@ def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
     problem = find("two-nodes")
     gains = Gains.from_bytes(design(problem, method="exact").canonical(), source="memory")
     proved = gains.certificate
-    assert (proved.kind, proved.form, gains.method) == ("exact", "full", "exact")
+    assert (proved.kind, proved.form, gains.method) == ("exact", "summed", "exact")
     assert proved.holds
     assert proved.exact is not None
     assert proved.floor is not None
-    assert proved.P is not None
-    assert proved.horizon is not None
     assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
     assert verify(gains).holds
     lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
     verdict = verify(gains.model_copy(update={"certificate": lower}))
     assert not verdict.holds
     assert verdict.failure is not None
+
+
+def test_ctrl_c_while_the_proof_is_made_does_not_lose_the_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    pressed: list[bool] = []
+    made = exact_design.confirmed
+
+    def confirmed(*claim: Any, **more: Any) -> Verdict:
+        if not pressed:
+            pressed.append(True)
+            raise KeyboardInterrupt
+        return made(*claim, **more)
+
+    monkeypatch.setattr(exact_design, "confirmed", confirmed)
+    problem = find("two-nodes")
+    gains = design_exact(problem, starts={"least variance": least_variance_gains(problem)}, budget=Budget(1e-9))
+    assert pressed
+    assert verify(gains).holds
 
 
 def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:

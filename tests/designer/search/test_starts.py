@@ -9,7 +9,7 @@ from networks import random_problem, real_networks
 from agent.contract.arrays import Array
 from designer.gain.exact import Operator
 from designer.model.error_model import error_model
-from designer.search.barrier import Entries
+from designer.search.entries import Entries
 from designer.search.starts import consensus_gains, least_variance_gains
 
 
