@@ -41,6 +41,7 @@ _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the ho
 _PATIENCE = 10
 _MOST_STEPS = 300  # for each mu
 _NOTHING = 1e-200  # gamma^2 below this is 0
+_VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
 
 class Progress(NamedTuple):
@@ -127,6 +128,7 @@ def descend(
         least, chosen = search.choose(starts)
     except KeyboardInterrupt:  # the search was over, and this takes seconds
         least, chosen = search.choose(starts)
+    search.refuse_nothing(least.gain.high**2)
     return Descent(chosen, least, search.start, search.steps, ended)
 
 
@@ -136,7 +138,7 @@ class _Search:
     def __init__(self, problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None) -> None:
         self.problem, self.budget, self.progress = problem, budget, progress
         self.barrier = Barrier(problem, _HORIZON)
-        self.start, self.steps = "", 0
+        self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[Array] = []  # v of the mean-square stable gains that the weights led to
         self.centred: list[Array] = []  # v of ever smaller gains
@@ -182,12 +184,17 @@ class _Search:
     def _begin(self, v: Array) -> Array:
         """[v; y] with g 10 % above gamma_T^2."""
         _, g = horizon_gain(self.barrier.operator(v), self.barrier.horizon, width=1e-3)
-        if g < _NOTHING:
+        self.refuse_nothing(g)
+        return np.append(v, math.log(1.1 * g))
+
+    def refuse_nothing(self, g: float) -> None:
+        """InputError where gamma^2 has come down to nothing."""
+        self.first = max(self.first, g)
+        if g < max(_NOTHING, _VANISHING * self.first):
             raise InputError(
                 f"{self.problem.name}: its measurements show z exactly, so the error can be 0 and there is no least "
                 "gain to design for; give every measurement noise of its own in D, or take --method decomposed"
             )
-        return np.append(v, math.log(1.1 * g))
 
     def _follow(self, mu: float, x: Array) -> bfgs.Point:
         """The minimum of J, only as exactly as the next mu needs it."""
