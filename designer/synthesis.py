@@ -32,7 +32,7 @@ def design(
 ) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
-    The default method is "exact" up to 200 nodes, else "decomposed". `progress` and `budget` are for the method
+    The default method is "exact" up to 100 nodes, else "decomposed". `progress` and `budget` are for the method
     "exact", which returns its best gains when its seconds are over, the proof after that, and on KeyboardInterrupt.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.

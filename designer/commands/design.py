@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
     "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster "
-    "(default: exact up to 200 nodes, else decomposed)"
+    "(default: exact up to 100 nodes, else decomposed)"
 )
 
 

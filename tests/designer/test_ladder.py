@@ -12,7 +12,7 @@ from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.ladder import Ladder, ladder_of, percent, rounded_up
 from designer.problems import find, names
-from designer.search.effort import BUDGET, default_method, in_words, refuse_without_memory, seconds_of_exact
+from designer.search.effort import BUDGET, MOST_NODES, default_method, in_words, refuse_without_memory, seconds_of_exact
 from designer.synthesis import design
 
 
@@ -82,10 +82,10 @@ def test_percentages() -> None:
     assert [percent(part) for part in (-0.2954, 0.031, 1e-9, -1e-9)] == ["-29.5 %", "+3.1 %", "0.0 %", "0.0 %"]
 
 
-def test_the_default_is_exact_up_to_200_nodes() -> None:
+def test_the_default_is_exact_up_to_a_number_of_nodes() -> None:
     """And for many designs of one problem, where they take ten minutes together at most."""
     assert {name: default_method(find(name)) for name in names()} == dict.fromkeys(names(), "exact")
-    assert [default_method(banded(n)) for n in (200, 201)] == ["exact", "decomposed"]
+    assert [default_method(banded(n)) for n in (MOST_NODES, MOST_NODES + 1)] == ["exact", "decomposed"]
     lossy = find("zhu2020-lossy")
     many = BUDGET / seconds_of_exact(lossy)
     assert [default_method(lossy, designs=part * many) for part in (0.9, 1.1)] == ["exact", "decomposed"]
