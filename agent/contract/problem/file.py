@@ -17,7 +17,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """What problem.toml says, as plain dicts and lists. Raises InputError where it is no TOML."""
     data = read_bytes(path, kind="problem file")
     try:
-        return tomllib.loads(data.decode())
+        return tomllib.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         kind = kind_of(data)
         why = f"it is {kind}" if kind in ("a recording", "a gains file") else f"it is not valid TOML: {error}"

@@ -28,6 +28,11 @@ def test_the_numbers_of_a_csv_become_part_of_the_problem(tmp_path: Path) -> None
     assert Problem.from_document(problem.document()) == problem
 
 
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
+    """Editors on Windows save one."""
+    assert load(tmp_path, "\ufeff" + TEXT) == load(tmp_path, TEXT)
+
+
 REFUSED = [
     # missing, unknown and misspelt fields
     ("", '"name" is missing'),
