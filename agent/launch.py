@@ -22,7 +22,7 @@ from typing import IO, Any, NamedTuple
 from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
-from agent.contract.recording.parts import files_of
+from agent.contract.recording import parts
 from agent.plan import Plan, RecordingPlan
 from agent.signals import heed, restore
 
@@ -88,9 +88,9 @@ def launch(
         try:
             crew.raise_what_happened(finished="steps" in summary)
         except RunBroken as error:
-            kept = files_of(recording)
+            kept = parts.files_of(recording)
             if crew.started and kept:
-                error.args = (f"{error}; what was recorded is in {' and '.join(map(str, kept))}",)
+                error.args = (f"{error}; what was recorded is in {parts.in_words(kept)}",)
             raise
     if "steps" not in summary:
         raise RunBroken("the coordinator ended without a summary")

@@ -120,7 +120,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
 def recorder_command(options: argparse.Namespace) -> int:
     """`peakmesh recorder GAINS -o FILE`."""
     from agent.contract.keys import RECORDER
-    from agent.contract.recording.parts import files_of
+    from agent.contract.recording import parts
     from agent.network.bus import Bus
     from agent.roles import recorder
 
@@ -129,7 +129,7 @@ def recorder_command(options: argparse.Namespace) -> int:
     path = options.output or default_recording(run)
     with Bus(_network(options), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
-    print(f"recording  {' '.join(map(str, files_of(path)))}")
+    print(f"recording  {parts.in_words(parts.files_of(path))}")
     return EXIT_GOOD
 
 

@@ -74,13 +74,15 @@ def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], No
 
 def run_text(result: dict[str, Any]) -> str:
     """The facts of a run, for people."""
-    first, *more = result["parts"] or [result["recording"]]
+    from agent.contract.recording.parts import in_words
+
+    files = result["parts"] or [result["recording"]]
     lines = [
         f"{result['steps']} steps, seed {result['seed']}: {result['messages']} messages recorded, "
         f"{result['missing']} missing",
         f"step 0 after {result['start_seconds']:.2f} s, then {result['rounds_per_second']:.0f} steps/s",
-        f"recording  {first}" + (f" and {len(more)} more, to {more[-1]}" if more else ""),
-        f"next       peakmesh replay {first}",  # it finds the other parts beside it
+        f"recording  {in_words(files)}",
+        f"next       peakmesh replay {files[0]}",  # it finds the other parts beside it
     ]
     if result["broken_off"]:
         lines.insert(1, f"NOT RECORDED TO THE END: {result['broken_off']}")

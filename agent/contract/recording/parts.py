@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from agent.contract.errors import InputError
@@ -30,6 +31,12 @@ def files_of(path: Path) -> list[Path]:
     later = [(int(found[1]), there) for there in path.parent.glob("*") if (found := name.fullmatch(there.name))]
     first = [there for there in (path, unfinished(path)) if there.exists()]
     return [*first, *(there for _, there in sorted(later))]
+
+
+def in_words(files: Sequence[Path | str]) -> str:
+    """The files of a recording as a person reads them: "run.mcap", "run.mcap and 2 more, to run.part3.mcap"."""
+    first, *more = files
+    return f"{first} and {len(more)} more, to {more[-1]}" if more else str(first)
 
 
 def refuse_recording(path: Path, *, force: bool) -> None:
