@@ -57,6 +57,7 @@ def topic_of(key_expression: str) -> str:
 
 # data
 MODE, PLANT_STATE, EVENT, ACCOUNT, EVIDENCE = "mode", "plant/state", "event", "account", "evidence"
+BESIDE = (EVENT, ACCOUNT, EVIDENCE)  # what is said of the run beside its steps
 
 
 def measurement(node: str) -> str:

@@ -1,8 +1,8 @@
 """Two recordings beside each other: the same run bit for bit, or how far apart, and where first.
 
 Messages are matched by topic and step, never by their place in the file, and compared number by number. Times,
-numbering and the run's name differ between any two runs, and are left alone; so are the
-recorder's evidence of them, and events, which say in words what happened.
+numbering and the run's name differ between any two runs, and are left alone; so is
+what stands beside the steps: events, accounts and the recorder's evidence.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from agent.contract.arrays import ulps
 from agent.contract.errors import RunBroken
-from agent.contract.keys import EVENT, EVIDENCE, MODE, PLANT_STATE, decode, model_of
+from agent.contract.keys import BESIDE, MODE, PLANT_STATE, decode, model_of
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
 from designer.compare.comparison import Comparison, Difference, Gap
@@ -69,7 +69,7 @@ class _Pairs:
             for side, logged in enumerate(pair):
                 if logged is None:
                     self._over[side] = True
-                elif logged.topic not in (EVENT, EVIDENCE):
+                elif logged.topic not in BESIDE:
                     self._take(side, logged)
         for side in (0, 1):
             for at in self._waiting[side]:

@@ -7,18 +7,18 @@ from collections.abc import Iterable
 import numpy as np
 
 from agent.contract.errors import RunBroken
-from agent.contract.keys import EVENT, EVIDENCE, decode
+from agent.contract.keys import BESIDE, decode
 from agent.contract.recording import Logged
 from designer.replay.topics import Numbers
 
 
 class Times:
-    """The log time of each message, and of each of so many steps, in ns since the epoch; not of events and evidence."""
+    """The log time of each message, and of each of so many steps, in ns since the epoch; not of what stands beside the steps."""
 
     def __init__(self, messages: Iterable[Logged], steps: int) -> None:
         self._of: dict[str, Numbers] = {}
         for logged in messages:
-            if logged.topic in (EVENT, EVIDENCE):
+            if logged.topic in BESIDE:
                 continue
             try:
                 step = decode(logged.topic, logged.payload).step

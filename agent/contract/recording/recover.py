@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, NamedTuple, Self
 
-from agent.contract.keys import EVENT, EVIDENCE, MODE, PLANT_STATE, model_of
+from agent.contract.keys import BESIDE, EVENT, EVIDENCE, MODE, PLANT_STATE, model_of
 from agent.contract.recording import Logged
 from agent.contract.recording.parts import refuse_recording, unfinished
 from agent.contract.recording.reader import Progress, RecordingReader
@@ -107,7 +107,7 @@ class _Steps:
         if step != self._step:
             self._step = step
             self._there.clear()
-        if topic not in (EVENT, EVIDENCE):
+        if topic not in BESIDE:
             self._there.add(topic)
         if step == self.complete and len(self._there) == self._topics:
             self.complete += 1
