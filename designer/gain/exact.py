@@ -60,7 +60,7 @@ class Operator:
         self.products = Products(model, Pattern(model) if pattern is None else pattern)
         self.links = None if model.links is None else _Links(model.links, modes, size + model.nw, model.plant_states)
         self.MM = np.broadcast_to(model.M.T @ model.M, (modes, size, size))
-        self.M = model.M
+        self.model, self.M = model, model.M
         self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
         self.p, self.size, self.nw = model.plant_states, size, model.nw
         self.eye_w = np.eye(self.nw)

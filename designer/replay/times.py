@@ -13,7 +13,7 @@ from designer.replay.topics import Numbers
 
 
 class Times:
-    """The log time of each message and of each of so many steps, in ns since the epoch; of what stands beside them, none."""
+    """The log time of each message and of each of so many steps, in ns since the epoch; not of what is beside steps."""
 
     def __init__(self, messages: Iterable[Logged], steps: int) -> None:
         self._of: dict[str, Numbers] = {}

@@ -302,7 +302,8 @@ def test_the_cheap_account_is_above_the_moments() -> None:
         joint[:, size:, :size] = joint[:, :size, size:].swapaxes(1, 2)
         joint[:, size:, size:] = chances[:, None, None] * np.outer(w, w)
         both = np.hstack([mean, chances[:, None] * w])
-        mean = PROBLEM.markov.transition.T @ np.einsum("sij,sj->si", acting.operator.AB, both)
+        AB = np.concatenate([acting.operator.model.A, acting.operator.model.B], axis=2)
+        mean = PROBLEM.markov.transition.T @ np.einsum("sij,sj->si", AB, both)
         X, chances = acting.operator.carry(joint), chances @ PROBLEM.markov.transition
         cheap.step(float(w @ w))
     assert all(cheap.rates(AS_DESIGNED)[2:])
