@@ -67,13 +67,15 @@ def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], num
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
-        yield from pool.map(function, items)
+        futures = [pool.submit(function, item) for item in items]
+        for future in futures:
+            yield future.result()
     except BrokenProcessPool:
         raise RunBroken("a worker process died; was there too little memory? --processes asks for fewer") from None
     finally:
         for worker in set(multiprocessing.active_children()) - others:
             worker.terminate()  # it is idle, or at a job whose result nobody waits for any more
-        pool.shutdown(cancel_futures=True)
+        pool.shutdown()  # no job is cancelled: Python 3.11 stumbles over cancelled ones of a worker that died
 
 
 def _begin_worker() -> None:
