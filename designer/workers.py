@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -67,9 +68,9 @@ def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], num
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
-        futures = [pool.submit(function, item) for item in items]
-        for future in futures:
-            yield future.result()
+        futures = deque(pool.submit(function, item) for item in items)
+        while futures:
+            yield futures.popleft().result()
     except BrokenProcessPool:
         raise RunBroken("a worker process died; was there too little memory? --processes asks for fewer") from None
     finally:
