@@ -34,6 +34,7 @@ class Finding(NamedTuple):
     mode: str
     sign: Sign
     at: str = ""  # more about where
+    exhausted: bool = False  # the steps, not the digits: more of these would not decide it
 
     @property
     def name(self) -> str:

@@ -16,11 +16,12 @@ from scipy import sparse
 
 from agent.contract.arrays import Array
 from designer.proof.ball_model import BallModel
-from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
+from designer.proof.float64 import LARGEST, TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 
 Indices = NDArray[np.int64]
 
 _MOST_TERMS = 20_000  # of the sum that P is
+_STEPS_OF_REACH = 8
 _STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
 
 
@@ -44,6 +45,7 @@ class FloatModel:
 
     def __init__(self, balls: BallModel) -> None:
         self.modes, self.size, self.order = len(balls.AB), balls.size, balls.size + balls.nw
+        self.states = len(balls.e[0])
         self.transition = enclosed([pi for row in balls.transition for pi in row], self.modes, self.modes)
         self.AB = self._mean(balls)  # block diagonal, a block for each mode
         self.AB_T = Enclosed(*(part.T.tocsr() for part in self.AB))
@@ -89,26 +91,38 @@ class FloatModel:
     def lyapunov(self) -> Array | None:
         """P(s) for (17), (modes, n_eta, n_eta), found and not proved; None where the errors do not decay.
 
-        P0 = I + L(I) + ... + L^k(I) with L^(k+1)(I) < I/2, V = P0 - L(P0) > I/2, and the largest c P0, but for a
-        factor: by Schur's complement I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B).
+        P0 = U + L(U) + ... + L^k(U) with L^(k+1)(U) < U/2, V = P0 - L(P0) > U/2, and the largest c P0, but for a
+        factor: by Schur's complement I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). U is I in natural units.
         """
-        n, eye = self.size, np.eye(self.size)
-        term = np.broadcast_to(eye, (self.modes, n, n))
+        n, D = self.size, weights(self._reach())
+        term = np.broadcast_to(np.diag(D * D), (self.modes, n, n))
         P0 = term.copy()
         for _ in range(_MOST_TERMS):
             term = self.weigh(term)[:, :n, :n]
-            largest = np.abs(term).sum(axis=2).max()  # a bound on every eigenvalue
+            largest = (times(np.abs(term), 1.0 / D) / D).max()  # a bound on every eigenvalue, relative to U
             if largest < 0.5:
                 break
-            if not within(term):
+            if not largest < LARGEST:
                 return None
             P0 = P0 + term
         else:
             return None
         S = self.weigh(P0)
         AB, BB = S[:, :n, n:], S[:, n:, n:]
-        worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(eye - term, AB)).max())
+        worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(np.diag(D * D) - term, AB)).max())
         return P0 / (worst * _STRICT) if worst > 0.0 else P0
+
+    def _reach(self) -> Array:
+        """About the square of what w of energy 1 makes of each state of the plant, and of its errors, (n_eta,)."""
+        n, nw = self.size, self.order - self.size
+        X, reach = np.zeros((self.modes, self.order, nw)), np.zeros((self.modes, n))
+        X[:, n:] = np.eye(nw)
+        for _ in range(_STEPS_OF_REACH):
+            moved = product(self.AB.middle, X.reshape(-1, nw)).reshape(self.modes, n, nw)
+            reach += (moved**2).sum(axis=2)
+            X[:, :n], X[:, n:] = moved, 0.0
+        of_state = reach.reshape(-1, self.states).max(axis=0)
+        return np.tile(np.where(of_state > 0.0, of_state, of_state.max()), n // self.states)
 
     def _mean(self, balls: BallModel) -> Enclosed:
         """[A B]."""

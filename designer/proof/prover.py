@@ -52,7 +52,11 @@ class Prover:
     @cached_property
     def P(self) -> Array | None:
         """What satisfies (17), as far as is known before it is proved; None where floats find none."""
-        return ByFloats(self._problem, self._K, self._H).model.lyapunov() if self._given is None else self._given
+        return self._floats.model.lyapunov() if self._given is None else self._given
+
+    @cached_property
+    def _floats(self) -> ByFloats:
+        return ByFloats(self._problem, self._K, self._H)
 
     def theorem1(self, gamma: float) -> Verdict:
         """(17) and (18) in every mode."""
@@ -100,16 +104,17 @@ class Prover:
         for k in range(len(self._makes)):
             by = self._arithmetic(k)
             answer = _Answer(question(by), by.name)
-            if proved(answer.findings) or refuted(answer.findings):
+            if proved(answer.findings) or refuted(answer.findings) or answer.findings[-1].exhausted:
                 break
-            if by.order > largest and k + 1 < len(self._makes):
+            if isinstance(by, ByFloats) and by.order > largest and k + 1 < len(self._makes):
                 more = f"(ball arithmetic, which sees further, is asked up to {largest} states of the errors)"
                 return answer._replace(arithmetic=f"{by.name} {more}")
         return answer
 
     def _arithmetic(self, k: int) -> Arithmetic:
         while len(self._made) <= k:
-            self._made.append(self._makes[len(self._made)](self._problem, self._K, self._H))
+            make = self._makes[len(self._made)]
+            self._made.append(self._floats if make is ByFloats else make(self._problem, self._K, self._H))
         return self._made[k]
 
     def _disproof(self, gamma: float) -> list[_Answer]:

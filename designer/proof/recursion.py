@@ -74,7 +74,7 @@ def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, m
                 open_ = every[-len(modes) + first]
                 open_ = open_._replace(sign=open_.sign._replace(proved=False, refuted=False))
                 return [*every[: -len(modes)], disproof(arithmetic, modes, gamma, most=2 * steps + 10) or open_]
-    end = Finding("Y < g P", modes[0], UNDECIDED, f" after {most} steps, and in none before")
+    end = Finding("Y < g P", modes[0], UNDECIDED, f" after {most} steps, and in none before", exhausted=True)
     return [*every, end]
 
 

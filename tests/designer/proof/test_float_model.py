@@ -18,13 +18,15 @@ from rational import Exact, plus, positive_definite, times, transposed
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.gain.exact import Operator, exact_gain, lyapunov
+from designer.gain.exact import exact_gain
+from designer.lmi.back_off import inequality_17
 from designer.model.error_model import error_model, link_gains
 from designer.proof import float64, float_model
 from designer.proof.ball_model import BallModel
 from designer.proof.by_floats import ByFloats, square
 from designer.proof.float64 import Bounded
 from designer.proof.float_model import FloatModel, enclosed
+from designer.proof.prover import FLOATS, Prover
 from designer.search.starts import consensus_gains
 
 VARIANTS = [
@@ -267,14 +269,38 @@ def test_numbers_out_of_range_decide_nothing(number: float) -> None:
 
 
 @pytest.mark.parametrize("variant", [VARIANTS[0], VARIANTS[11]], ids=str)
-def test_P_is_that_of_the_exact_gain(variant: dict[str, Any]) -> None:
-    """Written again, without the error model of designer.model."""
+def test_P_satisfies_17_and_hardly_more_of_it_does(variant: dict[str, Any]) -> None:
+    """By the other error model, in floats."""
     problem = real_network(random_problem(3), **variant)
+    gains = consensus_gains(problem, weight=0.2)
+    P = ByFloats(problem, *link_gains(problem, *gains)).model.lyapunov()
+    assert P is not None
+    for factor, holds in ((1.0, True), (1.01, False)):
+        least = np.linalg.eigvalsh(inequality_17(error_model(problem, *gains), factor * P)).min()
+        assert bool(least > 0.0) is holds
+
+
+def test_P_does_not_depend_on_units() -> None:
+    """x in units 2^40 apart: every entry of P is what it was, in the new units, and floats prove as much."""
+    problem = random_problem(3)
     K_bar, H_bar = consensus_gains(problem, weight=0.2)
-    P, radius = lyapunov(Operator(error_model(problem, K_bar, H_bar)))
-    assert P is not None, radius
+    units = np.array([2.0**20, 2.0**-20])
+    document, every_e = problem.document(), np.tile(units, problem.n)
+    document["plant"]["A"] = (problem.plant.A * units[:, None] / units).tolist()
+    document["plant"]["B"] = (problem.plant.B * units[:, None]).tolist()
+    document["plant"]["M"] = (problem.plant.M / units).tolist()
+    for node, said in zip(problem.nodes, document["node"], strict=True):
+        said["C"] = (node.C / units).tolist()
+    other = Problem.from_document(document)
     found = ByFloats(problem, *link_gains(problem, K_bar, H_bar)).model.lyapunov()
-    np.testing.assert_allclose(found, P, rtol=1e-10, atol=1e-12 * np.abs(P).max())
+    K, H = link_gains(other, K_bar * every_e[:, None] / every_e, H_bar * every_e[:, None])
+    in_units, every_eta = ByFloats(other, K, H).model.lyapunov(), np.tile(units, problem.n + 1)
+    assert found is not None
+    assert in_units is not None
+    np.testing.assert_allclose(in_units * every_eta * every_eta[:, None], found, rtol=1e-12)
+    gamma = 10.0
+    assert Prover(problem, *link_gains(problem, K_bar, H_bar), makes=FLOATS).exact(gamma).holds
+    assert Prover(other, K, H, makes=FLOATS).exact(gamma).holds
 
 
 def test_errors_that_grow_have_no_P() -> None:
