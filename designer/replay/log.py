@@ -139,6 +139,8 @@ def _log(
     finished = end.get("status") == "finished" and not damages
     last = content.last()
     expected = _integer(end, "steps", path=reader.path) if finished else last + 1
+    if damages and end.get("status") == "finished" and end.get("steps") == str(planned):
+        expected = max(last + 1, planned)
     if finished and expected != planned:
         strange.append(f"the end, it says that the run finished after {expected} of {planned} steps")
     steps = min(last + 1, expected)
