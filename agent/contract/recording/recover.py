@@ -57,11 +57,13 @@ def recover(
         for logged in reader.messages(report):
             if model_of(logged.topic) is not None:
                 sorter.add(logged)
+        written = 0
         steps = _Steps(2 + 2 * reader.gains.problem.n)
         try:
             with RecordingWriter(output, run=_facts(reader), gains=reader.gains, force=force) as writer:
                 for logged, step in sorter.messages():
                     writer.add(logged)
+                    written += logged.topic != EVIDENCE  # which the recorder itself has added
                     steps.count(logged.topic, step)
                 end = reader.end or _end(reader, steps.complete)
                 writer.finish(end)
@@ -69,7 +71,7 @@ def recover(
             unfinished(output).unlink(missing_ok=True)
             raise
         return Recovered(
-            messages=sorter.given,
+            messages=written,
             copies=sorter.copies,
             foreign=reader.foreign.total() + reader.others,
             status=end["status"],
@@ -120,7 +122,7 @@ class _Sorter:
         self._held: list[tuple[Key, Logged]] = []
         self._files: list[IO[bytes]] = []
         self._step = 0
-        self.given = self.copies = 0
+        self.copies = 0
 
     def add(self, logged: Logged) -> None:
         found = _STEP.search(logged.payload)
@@ -155,7 +157,6 @@ class _Sorter:
                 self.copies += 1
                 continue
             seen.add(content)
-            self.given += 1
             yield logged, step
 
     def __enter__(self) -> Self:
