@@ -94,10 +94,18 @@ class Account:
         shown = int(moving[-1]) + 2 if len(moving) else self.log.steps
         return shown if shown < MOST_OF_A_RUN * self.log.steps else self.log.steps
 
+    @property
+    def is_as_promised(self) -> bool:
+        """Whether nothing happened in this run that gamma does not cover."""
+        return self.verdict.ledger is None or self.verdict.ledger.is_plain
+
     @cached_property
     def mean_bound(self) -> Array | None:
-        """gamma sqrt(sum over j < k of |w(j)|^2), (steps,); None where gamma is not proved, or errors not known."""
-        if self.verdict.gamma.failure is not None or not self.log.has_plant:
+        """gamma sqrt(sum over j < k of |w(j)|^2), (steps,).
+
+        None where gamma is not proved, says less of this run than of any (faults, say), or errors are not known.
+        """
+        if self.verdict.gamma.failure is not None or not self.is_as_promised or not self.log.has_plant:
             return None
         return np.asarray(self.verdict.gamma.value * np.sqrt(self.trace.energy_before))
 

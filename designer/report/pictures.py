@@ -129,8 +129,14 @@ def _bounds(account: Account) -> Chart:
         tuple(marks),
         log=bool(highest > CLOSE * np.nanmax(norms, initial=0.0)),
         from_zero=True,
-        remark="" if account.mean_bound is not None else "No γ is drawn: none is proved for these gains.",
+        remark=_why_no_gamma(account) if account.mean_bound is None else "",
     )
+
+
+def _why_no_gamma(account: Account) -> str:
+    if account.is_as_promised:
+        return "No γ is drawn: none is proved for these gains."
+    return "No γ is drawn: in this run something happened that it does not cover."
 
 
 def _error_map(account: Account) -> Chart:

@@ -89,7 +89,7 @@ def divergence_sentence(first: Divergence) -> str:
 
 def error_sentence(account: Account) -> str:
     """How large the errors were, and what is promised of them."""
-    verdict, gamma = account.verdict, account.verdict.gamma
+    verdict = account.verdict
     if verdict.peak is None or not account.log.has_plant:
         return "How far off the estimates were is not known: real sensors measured, so nobody knows what was true."
     peak = verdict.peak
@@ -103,13 +103,17 @@ def error_sentence(account: Account) -> str:
             f"proved.{above}"
         )
     else:
-        why = (
-            "nothing is claimed of these gains"
-            if not gamma.is_claimed
-            else "what is claimed of these gains is not proved"
-        )
-        said.append(f"No bound in the mean stands beside it: {why}.")
+        said.append(f"No bound in the mean stands beside it: {_why_no_bound(account)}.")
     return " ".join(said)
+
+
+def _why_no_bound(account: Account) -> str:
+    gamma, ledger = account.verdict.gamma, account.verdict.ledger
+    if not gamma.is_claimed:
+        return "nothing is claimed of these gains"
+    if ledger is None or account.is_as_promised:
+        return "what is claimed of these gains is not proved"
+    return f"what is proved of these gains is of runs without faults, and of this one it says: {ledger.text()}"
 
 
 def proof_outcome(proof: Proof) -> tuple[str, str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_recordings import random_gains, random_problem, record, simulate
+from paced_runs import PacedRun
 from places import GOLDEN
 from reports import account_of, recorded
 from rewriting import read, write
@@ -203,6 +204,20 @@ def test_a_message_that_is_not_what_was_sent_is_named(tmp_path: Path) -> None:
     assert said.startswith("This recording is not a true account of the run: the plant, number ")
     assert "(plant/state, step 7)" in said
     assert said in Checked(page(account)).text
+
+
+def test_gamma_is_not_promised_of_a_run_with_faults(tmp_path: Path, golden: Account) -> None:
+    """A node that was away for a while: gamma is of runs as designed, and what the ledger says stands in its place."""
+    gains = golden.log.gains
+    faulty = PacedRun(gains, steps=40, away={"2": range(10, 20)}).messages
+    account = Account.of(record(tmp_path / "run.mcap", gains, faulty, steps=40, period="0.1"))
+    assert account.verdict.agrees
+    assert golden.mean_bound is not None
+    assert (account.mean_bound, account.chance) == (None, None)
+    assert "that is proved" not in error_sentence(account)
+    assert account.verdict.ledger is not None
+    assert f"of this one it says: {account.verdict.ledger.text()}" in error_sentence(account)
+    assert "something happened that it does not cover" in Checked(page(account)).text
 
 
 def test_what_a_filter_left_out_is_named_and_accuses_nobody(tmp_path: Path) -> None:
