@@ -33,6 +33,7 @@ class ByFloats:
             self.model.in_range = False  # nothing is decided
             self.name = f"float64, which is not used on this machine because {wrong},"
 
+    @np.errstate(all="ignore")  # what is not finite decides nothing
     def inequality_17(self, P: Array) -> list[Sign]:
         P, n = symmetric(P), self.model.size
         S = self.model.joint(P)
@@ -57,7 +58,7 @@ class ByFloats:
         MM = raised(self.model.peak, up=up)
         return np.tile(MM, (self.model.modes, 1, 1))
 
-    @np.errstate(all="ignore")  # what is not finite decides nothing
+    @np.errstate(all="ignore")
     def step(self, Y: Array, gamma: float, *, up: bool) -> tuple[list[Sign], Array | None]:
         S = self.model.joint(Y)
         if S is None:
@@ -78,6 +79,7 @@ class ByFloats:
     def floats(self, Y: Array) -> Array:
         return Y
 
+    @np.errstate(all="ignore")
     def _less(self, Y: Array, P: Array, g: float) -> list[Sign]:
         """The signs of g P - Y."""
         bound = g * symmetric(P)
