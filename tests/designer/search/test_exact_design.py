@@ -56,12 +56,11 @@ def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
     problem = find("two-nodes")
     gains = Gains.from_bytes(design(problem, method="exact").canonical(), source="memory")
     proved = gains.certificate
-    assert (proved.kind, proved.form, gains.method) == ("exact", "full", "exact")
+    assert (proved.kind, proved.form, gains.method) == ("exact", "summed", "exact")
     assert proved.holds
     assert proved.exact is not None
     assert proved.floor is not None
-    assert proved.P is not None
-    assert proved.horizon is not None
+    assert proved.P is None
     assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
     assert verify(gains).holds
     lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
@@ -71,9 +70,10 @@ def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
 
 
 def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
-    """floor <= exact gain of its gains <= its gamma."""
+    """floor <= exact gain of its gains <= its gamma <= what Theorem 1 certifies."""
     problem = find("two-nodes")
     proved = design(problem, method="theorem2-reduced").certificate
     assert proved.exact is not None
     assert proved.floor == floor(problem)
-    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6)
+    assert proved.by_theorem1 is not None
+    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6) <= proved.by_theorem1 * (1.0 + 1e-6)
