@@ -11,7 +11,7 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.proof import balls
 from designer.proof.ball_model import BallModel
-from designer.proof.balls import UNDECIDED, Sign, above, blocks, diagonal, exact, identity, of_blocks, part, sign
+from designer.proof.balls import UNDECIDED, Sign, above, below, blocks, diagonal, exact, identity, of_blocks, part, sign
 
 
 class ByBalls:
@@ -78,7 +78,7 @@ class ByBalls:
 
 
 def _rounded(Y: arb_mat, *, up: bool) -> arb_mat:
-    return above(Y) if up else -above(-Y)
+    return above(Y) if up else below(Y)
 
 
 def _blocks(model: BallModel, P: Array) -> list[list[int]]:

@@ -70,10 +70,8 @@ def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, m
             signs, Y = arithmetic.step(Y, gamma, up=True)
             every += found("recursion", modes, signs, _at(steps + 1, gamma))
             if Y is None:
-                first = next((k for k, sign in enumerate(signs) if not sign.proved), 0)
-                open_ = every[-len(modes) + first]
-                open_ = open_._replace(sign=open_.sign._replace(proved=False, refuted=False))
-                return [*every[: -len(modes)], disproof(arithmetic, modes, gamma, most=2 * steps + 10) or open_]
+                false = disproof(arithmetic, modes, gamma, most=2 * steps + 10)
+                return [*every[: -len(modes)], false or _left_open(every[-len(modes) :])]
     end = Finding("Y < g P", modes[0], UNDECIDED, f" after {most} steps, and in none before", exhausted=True)
     return [*every, end]
 
@@ -89,6 +87,12 @@ def disproof(arithmetic: Arithmetic, modes: Modes, gamma: float, *, most: int) -
         if Y is None:
             break
     return None
+
+
+def _left_open(last: list[Finding]) -> Finding:
+    """The first W of the last step that is not proved, or else the first, from which there was no going on."""
+    first = next((finding for finding in last if not finding.sign.proved), last[0])
+    return first._replace(sign=first.sign._replace(proved=False, refuted=False))
 
 
 def _at(step: int, gamma: float) -> str:

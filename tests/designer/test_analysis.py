@@ -22,6 +22,8 @@ from designer.gain.exact import exact_gain
 from designer.model.error_model import error_model, link_gains, stacked_gains
 from designer.problems import find
 from designer.proof.certificate import verify
+from designer.proof.findings import Verdict
+from designer.proof.prover import Prover
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 Document = dict[str, Any]
@@ -117,6 +119,20 @@ def test_somebody_elses_gains_get_a_certificate() -> None:
     assert gains.certificate.exact is not None
     assert gains.certificate.gamma == pytest.approx(gains.certificate.exact[1], rel=1e-6)
     assert Gains.from_bytes(gains.canonical(), source="memory") == gains
+
+
+def test_what_is_proved_of_given_gains_is_on_the_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without any file being written; where it is not proved, why."""
+    problem = random_problem(2)
+    analysis = analyse(problem, given(problem, 2, 0.1))
+    assert analysis.ladder.gamma == pytest.approx(analysis.ladder.exact[1], rel=1e-6)  # type: ignore[index]
+    assert "gamma, certified" in analysis.text()
+    assert analysis.document()["unproved"] is None
+    monkeypatch.setattr(Prover, "exact", lambda self, gamma: Verdict(False, gamma, "none", "of the moon", {}))
+    analysis = analyse(problem, given(problem, 2, 0.1))
+    assert analysis.ladder.gamma is None
+    assert "certified  no gamma: of the moon" in analysis.text()
+    assert analysis.document()["unproved"] == "of the moon"
 
 
 def test_a_certificate_of_given_gains_brings_the_worst_w_that_the_problem_asks_for() -> None:

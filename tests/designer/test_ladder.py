@@ -29,6 +29,23 @@ def test_the_distances() -> None:
     ]
 
 
+def test_both_of_a_designs_proved_gammas_are_rungs() -> None:
+    """Of an LMI's gains: the exact gain's, and Theorem 1's, which lies above all by as much as it was backed off."""
+    gains = design(find("zhu2020-lossy"), method="decomposed")
+    proved, lines = gains.certificate, ladder_of(gains).lines()
+    assert proved.theorem1_gamma is not None
+    assert [line.partition("  ")[2].partition(":")[0] for line in lines] == [
+        "floor",
+        "exact gain of these gains",
+        "gamma, certified",
+        "Theorem 2's bound",
+        "what Theorem 1 certifies of these gains",
+    ]
+    assert lines[2].startswith(rounded_up(proved.gamma))
+    assert lines[4].startswith(rounded_up(proved.theorem1_gamma))
+    assert [value for _, value in ladder_of(gains).rungs()] == sorted(value for _, value in ladder_of(gains).rungs())
+
+
 def test_what_is_not_there_is_not_said() -> None:
     """No percentage above a floor of zero, and no rung that was not computed."""
     assert Ladder(0.0, None, 1.0, None, None).lines() == [

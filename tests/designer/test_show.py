@@ -80,12 +80,15 @@ def test_what_gains_claim_is_shown_as_a_claim(tmp_path: Path) -> None:
     text = show.text(facts)
     assert re.search(rf'gamma +claimed {gamma}, by design; "peakmesh verify" checks it', text)
     assert not re.search("^(holds|verified|exact|floor)", text, re.MULTILINE)
-    document["certificate"] |= {"exact": [0.25, 0.5], "floor": 0.125, "lmi_gamma": 0.75}
+    assert "theorem1 gamma" not in text
+    more = {"exact": [0.25, 0.5], "floor": 0.125, "lmi_gamma": 0.75, "kind": "exact", "theorem1_gamma": 0.875}
+    document["certificate"] |= more
     Gains.model_validate(document).save(path, force=True)
     text = show.text(show.describe(path))
     assert re.search("exact +claimed between 0.25 and 0.5", text)
     assert re.search("floor +claimed 0.125", text)
     assert re.search("lmi gamma +claimed 0.75", text)
+    assert re.search("theorem1 gamma +claimed 0.875", text)
     assert f'claimed {gamma}, by design; "peakmesh replay" checks it' in show.text(show.describe(GOLDEN))
 
 

@@ -231,7 +231,7 @@ def test_a_horizon_that_is_too_short_is_not_proved(network: str, makes: Sequence
         return findings.proved(recursion(by, problem.mode_names, gains.certificate.gamma, P, most=most))
 
     steps = next(most for most in range(1, 200) if holds_within(most))
-    for horizon, holds in ((steps, True), (steps - 1, False), (1, False)):
+    for horizon, holds in ((steps, True), (steps + 100, True), (steps - 1, False), (1, False)):
         claim = gains.certificate.model_copy(update={"horizon": horizon})
         verdict = verify(gains.model_copy(update={"certificate": claim}), makes=makes)
         assert verdict.holds is holds

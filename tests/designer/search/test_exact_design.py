@@ -64,6 +64,7 @@ def test_method_exact_ends_in_a_certificate_of_kind_exact() -> None:
     assert proved.holds
     assert proved.exact is not None
     assert proved.floor is not None
+    assert proved.P is None
     assert proved.floor <= proved.exact[1] <= proved.gamma <= proved.exact[1] * (1.0 + 1e-4)
     assert verify(gains).holds
     lower = proved.model_copy(update={"gamma": proved.gamma * (1.0 - 1e-4)})
@@ -90,9 +91,10 @@ def test_ctrl_c_while_the_proof_is_made_does_not_lose_the_gains(monkeypatch: pyt
 
 
 def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
-    """floor <= exact gain of its gains <= its gamma."""
+    """floor <= exact gain of its gains <= its gamma <= what Theorem 1 certifies."""
     problem = find("two-nodes")
     proved = design(problem, method="theorem2-reduced").certificate
     assert proved.exact is not None
     assert proved.floor == floor(problem)
-    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6)
+    assert proved.by_theorem1 is not None
+    assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6) <= proved.by_theorem1 * (1.0 + 1e-6)
