@@ -265,8 +265,9 @@ def test_edited_problem(folder: Path, gains: Gains, capsys: pytest.CaptureFixtur
     assert "the problem was edited afterwards; design the gains again" in capsys.readouterr().err
 
 
-def test_wrong_words(capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Unknown commands, methods and senseless numbers: exit 2."""
+    monkeypatch.setattr("designer.workers.PATIENCE", 1)  # seconds for a Dask scheduler that is not there
     assert run() == 2
     assert "COMMAND" in capsys.readouterr().err
     for words in (["dance"], ["run", "two-nodes", "--steps", "0"], ["run", "two-nodes", "--seed", "-1"]):
