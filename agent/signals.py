@@ -12,10 +12,11 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+Handler = Callable[[int, FrameType | None], None]
 Handlers = dict[int, Any]  # of signals; what signal.signal returns
 
 
-def heed(handler: Callable[[int, FrameType | None], None]) -> Handlers:
+def heed(handler: Handler) -> Handlers:
     """Have `handler` called when this program is asked to end; returns what was there before, for `restore`."""
     asked = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:

@@ -40,7 +40,7 @@ from agent.network.words import (
     UnderWay,
     Words,
 )
-from agent.signals import heed, restore
+from agent.signals import Handler, Handlers, heed, restore
 
 # Seconds of silence that end a wait. Silence, because on a busy machine everything takes long, but goes on.
 REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
@@ -59,7 +59,16 @@ class Bus:
     One thread may publish and take from channels; everything else belongs to the main thread.
     """
 
-    def __init__(self, network: Network, *, run: str, who: str) -> None:
+    def __init__(
+        self,
+        network: Network,
+        *,
+        run: str,
+        who: str,
+        session: Callable[..., Session] = Session,
+        signals: Callable[[Handler], Handlers] = heed,
+    ) -> None:
+        """`session` opens the door to zenoh, `signals` asks for those that end a program; a simulation has its own."""
         self.run, self.who, self.network = run, who, network
         self._words = Words(who)
         self._outbox = Outbox(who)
@@ -72,8 +81,8 @@ class Bus:
         self._given_up = math.inf  # when it is not waited for any more
         self.step = 0  # of a paced run: the first of which we have had no mode
         self.identity = ""  # of the run
-        self._session = Session(network, run=run, hand_over=self._words.put)
-        self._handlers = heed(self._on_signal)
+        self._session = session(network, run=run, hand_over=self._words.put)
+        self._handlers = signals(self._on_signal)
 
     def __enter__(self) -> Self:
         return self
