@@ -23,12 +23,10 @@ from agent.contract.problem import Problem
 from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
-from designer.gain.worst_case import with_worst_case, worst_disturbance, worst_policy
+from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
 from designer.ladder import Ladder
 from designer.model.error_model import error_model, stacked_links
 from designer.search.exact_design import certify, confirmed
-
-_MOST_COLUMNS = 200  # of w over all steps, in the search for the worst w that is fixed beforehand
 
 
 class GivenGains(NamedTuple):
@@ -127,7 +125,7 @@ class Analysis(NamedTuple):
             lines.append(f"certified  no gamma: {self.unproved}")
         lines += [
             f"stable     mean-square; each step multiplies E|error|^2 by {self.radius:.6g} in the long run",
-            f"exact gain between {low:.8g} and {high:.8g}, from {self.horizon} steps and a bound on the rest",
+            f"exact gain between {low:.8g} and {high:.8g}: {_steps(self.horizon)} show that it is no less",
             f"ladder     {rungs}",
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
             f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
@@ -179,8 +177,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
         return Analysis(problem, given, False, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
     verdict = confirmed(problem, given.K, given.H, gain.high)
     policy = worst_policy(model, horizon=gain.horizon)
-    within = min(gain.horizon, max(_MOST_COLUMNS // problem.nw, 1))
-    fixed = worst_disturbance(model, initial=problem.mode_index(problem.markov.initial), horizon=within)
+    fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
         problem=problem,
         given=given,
@@ -192,7 +189,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
         steps=len(policy.Gamma) + 1,
         u=policy.u * (-1.0 if policy.u[np.abs(policy.u).argmax()] < 0.0 else 1.0),
         fixed=fixed.gain,
-        fixed_within=within,
+        fixed_within=fixed.within,
         w=fixed.w,
         unproved=verdict.failure,
     )

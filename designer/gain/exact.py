@@ -17,8 +17,7 @@ from agent.contract.arrays import Array
 from designer.gain.products import Collected, Pattern, Products
 from designer.model.error_model import ErrorModel, LinkTerms
 
-_WIDTH = 4e-7  # relative width of the bracket of gamma_T^2
-_TAIL = 5e-7  # the tail's tau_T^2, relative to gamma^2
+_WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
@@ -26,7 +25,7 @@ _STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that sat
 
 
 class Gain(NamedTuple):
-    """gamma lies in [low, high]: low = gamma_T, high^2 = gamma_T^2 + tau_T^2, T = horizon.
+    """gamma lies in [low, high]: at low^2 the recursion fails within `horizon` steps, at high^2 it never does.
 
     Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None.
     """
@@ -34,8 +33,7 @@ class Gain(NamedTuple):
     low: float
     high: float
     horizon: int
-    tail: float  # tau_T^2
-    P: Array | None  # (modes, n_eta, n_eta), satisfies (17) strictly; the tail is measured by it
+    P: Array | None  # (modes, n_eta, n_eta), satisfies (17) strictly; in its invariant set the recursion ends
     radius: float  # spectral radius of the operator L of `Operator.corner`: what E|eta|^2 is multiplied by, per step
 
     @property
@@ -166,84 +164,99 @@ class InvariantSet:
     """
 
     def __init__(self, P: Array) -> None:
-        P_inverse = np.linalg.inv(P)
         self.P = P  # (modes, n_eta, n_eta)
-        self.P_inverse = (P_inverse + P_inverse.swapaxes(1, 2)) / 2.0
 
     def contains(self, Y: Array, g: float) -> bool:
-        """Cholesky decides, once the sum of all eigenvalues of Y relative to P, which is cheap, is at most g."""
-        if np.vdot(Y, self.P_inverse) > g:
-            return False
+        """Cholesky decides."""
         try:
-            np.linalg.cholesky(g * self.P - Y)
+            return bool(np.isfinite(np.linalg.cholesky(g * self.P - Y)).all())
         except np.linalg.LinAlgError:
             return False
-        return True
 
 
-def horizon_holds(
-    operator: Operator, g: float, horizon: int, *, invariant: InvariantSet | None = None
-) -> tuple[bool, float]:
-    """Whether gamma_T^2 <= g: every W positive definite; and sum_k min_s log det(W / g), a measure of how far.
+class Trial(NamedTuple):
+    """The recursion at one g."""
 
-    Steps and sum end early in an invariant set.
+    holds: bool | None  # None: it has not come to its end
+    measure: float  # sum over steps of min_s log det(W / g): how far it is from failing
+    steps: int
+
+
+def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: InvariantSet | None = None) -> Trial:
+    """Whether gamma_T^2 <= g, T = horizon: whether every W is positive definite.
+
+    With an invariant set the question is whether gamma^2 <= g; it is looked for every now and then, so that looking
+    takes a sixteenth more steps, not as long as they.
     """
-    Y, total = operator.MM, 0.0
-    for _ in range(horizon):
+    Y, measure, next_look = operator.MM, 0.0, 1
+    for steps in range(1, horizon + 1):
         taken = step(operator, Y, g)
         if taken is None:
-            return False, -math.inf
-        Y = taken.Y
-        total += float(taken.log_det.min())
-        if invariant is not None and invariant.contains(Y, g):
-            break
-    return True, total
+            return Trial(False, -math.inf, steps)
+        Y, measure = taken.Y, measure + float(taken.log_det.min())
+        if invariant is not None and steps >= next_look:
+            if invariant.contains(Y, g):
+                return Trial(True, measure, steps)
+            next_look = steps + 1 + steps // 16
+    return Trial(True if invariant is None else None, measure, horizon)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
-def exact_gain(model: ErrorModel) -> Gain:
-    """The exact gain of an error model, between bounds that differ by 1e-6 of it at most; T is chosen on the way."""
+def exact_gain(model: ErrorModel, *, above: float | None = None) -> Gain:
+    """The exact gain of an error model, between bounds that differ by 1e-6 of its square where steps suffice.
+
+    `above`: a lower bound of gamma^2, where the search begins.
+    """
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     P, radius = lyapunov(operator)
     if P is None:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
-        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, math.inf, None, radius)
-    invariant = InvariantSet(P)
-    horizon, tail, impulse = _horizon(operator, invariant)
-    low, high = horizon_gain(operator, horizon, above=impulse, invariant=invariant)
-    return Gain(math.sqrt(low), math.sqrt(high + tail), horizon, tail, P, radius)
+        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, radius)
+    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), above, _WIDTH)
+    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P, radius)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def horizon_gain(
-    operator: Operator,
-    horizon: int,
-    *,
-    width: float = _WIDTH,
-    above: float | None = None,
-    invariant: InvariantSet | None = None,
+    operator: Operator, horizon: int, *, width: float = _WIDTH, above: float | None = None
 ) -> tuple[float, float]:
-    """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high.
+    """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high."""
+    found = _bracket(operator, horizon, None, above, width)
+    return found.low, found.high
 
-    `above` is a lower bound of gamma_T^2, where the search begins.
+
+class _Bracket(NamedTuple):
+    low: float
+    high: float
+    horizon: int  # in which the recursion fails at low
+
+
+def _bracket(
+    operator: Operator, horizon: int, invariant: InvariantSet | None, above: float | None, width: float
+) -> _Bracket:
+    """Where the recursion fails, and where it holds.
 
     As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
-    recursion held give p and the root; where that leads nowhere, g is tried a fifth above low.
+    recursion held give p and the root; where that leads nowhere, g is tried a fifth above low. Where it has not come
+    to its end at some g, the bracket stays wider.
     """
-    low, growth, tiny = 0.0, 2.0, float(np.finfo(float).tiny)
+    low, steps, growth, tiny = 0.0, 1, 2.0, float(np.finfo(float).tiny)
     g = growth * max(_impulse(operator) if above is None else above, tiny)
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > max(low * (1.0 + 1.001 * width), 2.0 * tiny):
         if not math.isfinite(g):
-            return low, math.inf
-        holds, measure = horizon_holds(operator, g, horizon, invariant=invariant)
-        if holds:
-            held = [*held[-2:], (g, measure)]
+            return _Bracket(low, math.inf, steps)
+        trial = recursion_holds(operator, g, horizon, invariant=invariant)
+        if trial.holds:
+            held = [*held[-2:], (g, trial.measure)]
+        elif trial.holds is None and held:
+            break
         else:
-            low, growth = g, growth * growth
-        g = _next_trial(low, held, width, fit=holds) if held else growth * low
-    return low, held[-1][0]
+            growth *= growth
+            low, steps = (g, trial.steps) if trial.holds is False else (low, steps)
+        g = _next_trial(low, held, width, fit=bool(trial.holds)) if held else growth * max(low, g)
+    return _Bracket(low, held[-1][0], steps)
 
 
 def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:
@@ -328,20 +341,3 @@ def _grows(sizes: list[float]) -> bool:
         return False
     early, late = sizes[k // 2] - sizes[k // 4], sizes[k] - sizes[k // 2]
     return late > 0.0 and abs(late - 2.0 * early) < 0.02 * late
-
-
-def _horizon(operator: Operator, invariant: InvariantSet) -> tuple[int, float, float]:
-    """The first T at which tau_T^2 is small beside gamma^2, tau_T^2, and the most that one step of w gains.
-
-    tau_T^2 = max_s lambda_max(L^T(M'M) relative to P).
-    """
-    Y, size, steps, impulse = operator.MM, operator.size, 0, 0.0
-    while steps < 2 or float((Y * invariant.P_inverse).sum(axis=(1, 2)).max()) > _TAIL * impulse:  # trace >= eigenvalue
-        S = operator.joint(operator.bar(Y))
-        impulse = max(impulse, float(np.linalg.eigvalsh(S[:, size:, size:]).max()))  # <= gamma^2: one step of w
-        Y, steps = S[:, :size, :size], steps + 1
-    L = np.linalg.cholesky(invariant.P)
-    half = np.linalg.solve(L, Y)
-    relative = np.linalg.solve(L, half.swapaxes(1, 2))
-    tail = float(np.linalg.eigvalsh((relative + relative.swapaxes(1, 2)) / 2.0).max())
-    return steps, tail, impulse

@@ -16,7 +16,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.gain.exact import Operator, horizon_gain, horizon_holds, step
+from designer.gain.exact import Operator, horizon_gain, recursion_holds, step
 from designer.gain.products import Collected, Pattern
 from designer.model.error_model import ErrorModel, Indices, LinkTerms, error_model, stacks
 
@@ -177,7 +177,7 @@ def critical_sweep(operator: Operator, horizon: int) -> tuple[float, Sweep]:
     first, last = 0, horizon
     while last - first > 1:
         middle = (first + last) // 2
-        holds, _ = horizon_holds(operator, low * (1.0 - 1e-8), middle)
+        holds = recursion_holds(operator, low * (1.0 - 1e-8), middle).holds
         first, last = (middle, last) if holds else (first, middle)
     _, g = horizon_gain(operator, last, width=1e-13)
     swept, above = sweep(operator, g, last), 1e-14

@@ -46,6 +46,7 @@ class Disturbance(NamedTuple):
 
     gain: float  # sqrt of E|z_tilde|^2
     w: Array  # (T, nw)
+    within: int  # the steps that it was sought over
 
 
 def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Disturbance:
@@ -61,7 +62,7 @@ def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Distu
         joints.append(operator.joint(operator.bar(Y)))
         Y = joints[-1][:, :size, :size]
     left = _traces_of_w(operator, model, initial, horizon)
-    best = Disturbance(0.0, np.zeros((1, nw)))
+    best = Disturbance(0.0, np.zeros((1, nw)), horizon)
     for T in range(1, horizon + 1):
         gram = np.zeros((T * nw, T * nw))
         for k in range(T):
@@ -71,17 +72,21 @@ def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Distu
             gram[: k * nw, at] = (means.swapaxes(1, 2) @ joints[T - 1 - k][:, :size, size:]).sum(axis=0)
         eigenvalues, vectors = np.linalg.eigh(gram, UPLO="U")
         if eigenvalues[-1] > best.gain**2:
-            best = Disturbance(math.sqrt(eigenvalues[-1]), vectors[:, -1].reshape(T, nw))
+            best = Disturbance(math.sqrt(eigenvalues[-1]), vectors[:, -1].reshape(T, nw), horizon)
     return best
 
 
 def worst_for(gains: Gains) -> Disturbance:
-    """The worst fixed w of gains from their initial mode, over a horizon that is doubled until the gain has settled.
+    """The worst fixed w of gains from their initial mode."""
+    problem = gains.problem
+    return worst_fixed(error_model(problem, *stacked_gains(gains)), initial=problem.mode_index(problem.markov.initial))
+
+
+def worst_fixed(model: ErrorModel, *, initial: int) -> Disturbance:
+    """The worst fixed w from r(0) = initial, over a horizon that is doubled until the gain has settled.
 
     At the longest horizon that is affordable the search ends, settled or not; `gain` is true of `w` in any case.
     """
-    model = error_model(gains.problem, *stacked_gains(gains))
-    initial = gains.problem.mode_index(gains.problem.markov.initial)
     most = int(min(_MOST_ROWS / model.nw, (2.0 * _MOST_NUMBERS / (model.modes * model.size * model.nw)) ** 0.5))
     horizon = max(1, min(8, most))
     worst = worst_disturbance(model, initial=initial, horizon=horizon)

@@ -22,7 +22,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, horizon_gain, horizon_holds, lyapunov
+from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, horizon_gain, lyapunov, recursion_holds
 from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
 from designer.search.barrier import Barrier
@@ -178,8 +178,8 @@ class _Search:
     def _is_short(self, operator: Operator, x: Array, P: Array, mu: float) -> bool:
         """Whether the exact gain of these gains is above sqrt(g)."""
         above = 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
-        holds, _ = horizon_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
-        return not holds and self._may_be_longer()
+        trial = recursion_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
+        return trial.holds is False and self._may_be_longer()
 
     def _begin(self, v: Array) -> Array:
         """[v; y] with g 10 % above gamma_T^2."""
@@ -272,7 +272,7 @@ class _Search:
             operator = self.barrier.operator(v)
             P, radius = lyapunov(operator)
             g = (_SLACK * least.gain.high) ** 2
-            if P is not None and horizon_holds(operator, g, _LONG, invariant=InvariantSet(P))[0]:
+            if P is not None and recursion_holds(operator, g, _LONG, invariant=InvariantSet(P)).holds:
                 near[_cost(float(np.linalg.norm(v)), radius), len(near)] = v
         return near
 

@@ -12,7 +12,8 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from designer.gain.exact import InvariantSet, Operator, exact_gain, horizon_gain, horizon_holds, step
+from designer.gain import exact
+from designer.gain.exact import InvariantSet, Operator, exact_gain, horizon_gain, recursion_holds, step
 from designer.gain.floor import floor
 from designer.gain.sensitivity import gain_slope
 from designer.gain.worst_case import Policy, path_gain, worst_disturbance, worst_policy
@@ -220,9 +221,23 @@ def test_a_sweep_that_ends_in_the_invariant_set_ends_as_a_long_one_does(case: Ca
     invariant, larger = InvariantSet(gain.P), InvariantSet(1e6 * gain.P)
     g = gain.low**2
     for factor in (0.5, 0.9, 1.0 - 1e-3, 1.0 - 1e-6, 1.0 + 2e-6, 1.0 + 1e-3, 1.1, 2.0, 10.0):
-        early, _ = horizon_holds(operator, factor * g, 400, invariant=invariant)
-        assert early == horizon_holds(operator, factor * g, 400)[0] == (factor > 1.0)
-    assert horizon_holds(operator, g * (1.0 - 1e-3), 400, invariant=larger)[0]
+        early = recursion_holds(operator, factor * g, 400, invariant=invariant)
+        late = recursion_holds(operator, factor * g, 400)
+        assert early.holds == late.holds == (factor > 1.0)
+        assert early.steps <= late.steps
+    assert recursion_holds(operator, g * (1.0 - 1e-3), 400, invariant=larger).holds
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_search_whose_sweeps_end_too_soon_leaves_its_interval_wider_and_true(case: Case) -> None:
+    """Of 10 steps at most, those near gamma do not come to their end."""
+    model = error_model(*case)
+    operator, gain = Operator(model), exact_gain(model)
+    assert gain.P is not None
+    found = exact._bracket(operator, 10, InvariantSet(gain.P), None, 1e-6)
+    assert found.low <= gain.high**2
+    assert gain.low**2 <= found.high < math.inf
+    assert found.high > 1.0001 * found.low
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -255,7 +270,7 @@ def test_a_disturbance_that_moves_nothing_changes_nothing(case: Case) -> None:
     assert (model.nw, more.nw) == (1, 2)
     gain, other = exact_gain(model), exact_gain(more)
     assert gain.horizon == other.horizon
-    assert (gain.low, gain.high, gain.tail) == pytest.approx((other.low, other.high, other.tail), rel=1e-6)
+    assert gain.bounds == pytest.approx(other.bounds, rel=1e-6)
 
 
 def test_errors_that_nothing_moves_have_the_gain_0() -> None:
