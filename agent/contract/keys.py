@@ -1,6 +1,7 @@
 """Every key expression: who says what to whom. One table for the runtime, the recorder and the replay.
 
-Keys are `peakmesh/<run>/<topic>`. Messages of the data topics are recorded as they were on the wire:
+Keys are `peakmesh/<run>/<topic>`; where several may say something on a topic, `peakmesh/<run>/<topic>/<who>`, so that a
+key always says who speaks. Messages of the data topics are recorded as they were on the wire:
 
 | topic                  | model       | from                       | to                                         |
 |------------------------|-------------|----------------------------|--------------------------------------------|
@@ -17,7 +18,7 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 |------------------------|-------------|----------------------------|--------------------------------------------|
 | alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
 | session/<who>/<id>     | liveliness  | everyone but sensors       | <who>: is it there twice?                  |
-| refused/<id>           | a sentence  | everyone but sensors       | session <id>: its place is taken           |
+| refused/<who>/<id>     | a sentence  | everyone but sensors       | session <id> of <who>: its place is taken  |
 | ready/<who>            | Ready       | everyone but sensors       | coordinator, recorder: it has seen others  |
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
@@ -46,18 +47,31 @@ from agent.contract.messages import Account, Estimate, Event, Evidence, Measurem
 from agent.contract.problem import Problem
 
 
-def key(run: str, topic: str) -> str:
-    return f"peakmesh/{run}/{topic}"
+def key(run: str, topic: str, *, who: str = "*") -> str:
+    """What is said on a topic; on one that several share, what `who` says there."""
+    return f"peakmesh/{run}/{topic}/{who}" if _is_shared(topic) else f"peakmesh/{run}/{topic}"
 
 
 def topic_of(key_expression: str) -> str:
     """The inverse of `key`."""
-    return key_expression.split("/", 2)[2]
+    topic = key_expression.split("/", 2)[2]
+    shared, _, _who = topic.rpartition("/")
+    return shared if _is_shared(shared) else topic
+
+
+def speaker_of(key_expression: str) -> str:
+    """Who speaks under a key of a topic that several share; "" for any other key: `sender_of` its topic does."""
+    topic, _, who = key_expression.split("/", 2)[2].rpartition("/")
+    return who if _is_shared(topic) else ""
 
 
 # data
 MODE, PLANT_STATE, EVENT, ACCOUNT, EVIDENCE = "mode", "plant/state", "event", "account", "evidence"
 BESIDE = (EVENT, ACCOUNT, EVIDENCE)  # what is said of the run beside its steps
+
+
+def _is_shared(topic: str) -> bool:
+    return topic.removeprefix(watch("")) in (EVENT, ACCOUNT)
 
 
 def measurement(node: str) -> str:
@@ -117,8 +131,8 @@ def session(who: str, identity: str) -> str:
     return f"session/{who}/{identity}"
 
 
-def refused(identity: str) -> str:
-    return f"refused/{identity}"
+def refused(who: str, identity: str) -> str:
+    return f"refused/{who}/{identity}"
 
 
 def ready(who: str) -> str:
@@ -136,6 +150,7 @@ def watch(topic: str) -> str:
 
 # who there is
 COORDINATOR, PLANT, RECORDER = "coordinator", "plant", "recorder"
+VIEWER = "viewer"  # looks on, and takes no part
 
 
 def node_who(node: str) -> str:

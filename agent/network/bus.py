@@ -81,7 +81,7 @@ class Bus:
         self._given_up = math.inf  # when it is not waited for any more
         self.step = 0  # of a paced run: the first of which we have had no mode
         self.identity = ""  # of the run
-        self._session = session(network, run=run, hand_over=self._words.put)
+        self._session = session(network, run=run, who=who, hand_over=self._words.put)
         self._handlers = signals(self._on_signal)
 
     def __enter__(self) -> Self:
@@ -124,7 +124,7 @@ class Bus:
             self._listen(CONTROL, Control)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
-        self._session.listen(refused(self._session.identity), _refuse)
+        self._session.listen(refused(self.who, self._session.identity), _refuse)
         self._session.watch()
         self._session.watch_namesakes(self.who)
         self._session.appear(self.who)
@@ -134,7 +134,7 @@ class Bus:
         own = self._session.identity
         sentence = f'{in_words(self.who)} takes part in run "{self.run}" already; start it once'
         if identity != own and self.has_begun:
-            self._session.say(refused(identity), sentence.encode())
+            self._session.say(refused(self.who, identity), sentence.encode())
         elif identity < own:
             raise Refused(sentence)
 

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import alive, key, replay, session, topic_of, watch
+from agent.contract.keys import alive, key, replay, session, speaker_of, topic_of, watch
 from agent.contract.messages import Stamp
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
@@ -50,10 +50,10 @@ class Channel:
 
 
 class Session:
-    """A zenoh session, opened for `run`; `hand_over` takes the duties, on any thread."""
+    """A zenoh session of `who`, opened for `run`; `hand_over` takes the duties, on any thread."""
 
-    def __init__(self, network: Network, *, run: str, hand_over: Callable[[Duty], None]) -> None:
-        self._run, self._hand_over = run, hand_over
+    def __init__(self, network: Network, *, run: str, who: str, hand_over: Callable[[Duty], None]) -> None:
+        self._run, self._who, self._hand_over = run, who, hand_over
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._shown: dict[str, zenoh.Publisher] = {}  # the same for viewers
         self._watched: dict[str, bool] = {}  # whether a viewer is there
@@ -79,10 +79,10 @@ class Session:
     def advertise(self, topic: str, *, express: bool) -> None:
         """Announce that a topic will be published; an `express` message does not wait for others to go with."""
         self._publishers[topic] = self._zenoh.declare_publisher(
-            key(self._run, topic), congestion_control=BLOCK, express=express
+            key(self._run, topic, who=self._who), congestion_control=BLOCK, express=express
         )
         shown = self._shown[topic] = self._zenoh.declare_publisher(
-            key(self._run, watch(topic)), congestion_control=DROP
+            key(self._run, watch(topic), who=self._who), congestion_control=DROP
         )
         self._watched[topic] = False
 
@@ -106,7 +106,7 @@ class Session:
                 if not first.isdecimal() or "_anyke" not in query.parameters:
                     return  # not the recorder's question
                 for sent in since(int(first)):
-                    query.reply(key(self._run, sent.topic), sent.payload, attachment=sent.stamp.encode())
+                    query.reply(key(self._run, sent.topic, who=who), sent.payload, attachment=sent.stamp.encode())
 
         self._declared.append(
             self._zenoh.declare_queryable(
@@ -189,6 +189,8 @@ def _sample(topic: str, sample: zenoh.Sample) -> Sample:
         stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
     except ValueError as error:
         raise RunBroken(f"a message on {topic} has no readable stamp: {error}") from None
+    if stamp is not None and (speaker := speaker_of(str(sample.key_expr))) not in ("", stamp.sender):
+        raise RunBroken(f"a message on {topic} from {speaker} says that it is from {stamp.sender}")
     return Sample(topic, sample.payload.to_bytes(), stamp)
 
 

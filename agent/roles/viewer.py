@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, data_topics, model_of
+from agent.contract.keys import COORDINATOR, EVENT, VIEWER, data_topics, model_of
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
 from agent.network.words import ChannelClosed, Words
@@ -30,7 +30,7 @@ def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: 
     Raises RunBroken where the run is not there within `network.wait` seconds, InputError where the port is taken.
     """
     words = Words("")
-    with _stopped_by_signals(), closing(Session(network, run=run, hand_over=words.put)) as session:
+    with _stopped_by_signals(), closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session:
         overheard = session.overhear()
         with _server(gains, run, host, port) as (address, show):
             say(address)

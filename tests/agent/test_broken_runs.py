@@ -178,7 +178,7 @@ def test_garbage_on_a_topic_ends_the_run_in_order(lone_path: Path, tmp_path: Pat
         config.insert_json5("listen/endpoints", '["tcp/127.0.0.1:0"]')
         config.insert_json5("scouting/multicast/enabled", "false")
         with zenoh.open(config) as session:
-            publisher = session.declare_publisher("peakmesh/test/event")
+            publisher = session.declare_publisher("peakmesh/test/event/somebody")
             while not publisher.matching_status.matching:
                 time.sleep(0.01)
             for _ in range(3):

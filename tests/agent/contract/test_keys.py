@@ -36,6 +36,7 @@ from agent.contract.keys import (
     sender_of,
     sensor_who,
     session,
+    speaker_of,
     topic_of,
     watch,
 )
@@ -46,9 +47,18 @@ NAMES = st.from_regex(r"[A-Za-z0-9_-]{1,64}", fullmatch=True)
 
 @given(NAMES, NAMES)
 def test_a_topic_is_the_inverse_of_its_key(run: str, node: str) -> None:
-    for topic in (MODE, PLANT_STATE, EVENT, measurement(node), estimate(node)):
-        assert topic_of(key(run, topic)) == topic
+    for topic in (MODE, PLANT_STATE, EVENT, ACCOUNT, measurement(node), estimate(node)):
+        for shown in (topic, watch(topic)):
+            assert topic_of(key(run, shown, who=node_who(node))) == topic_of(key(run, shown)) == shown
         assert key(run, topic).split("/")[:2] == ["peakmesh", run]
+
+
+@given(NAMES, NAMES)
+def test_every_key_of_data_says_who_speaks(run: str, node: str) -> None:
+    """By its end where several share the topic, by the topic itself otherwise; measurements have two that may."""
+    who = node_who(node)
+    assert [speaker_of(key(run, topic, who=who)) for topic in (EVENT, ACCOUNT, watch(EVENT))] == [who] * 3
+    assert {speaker_of(key(run, topic, who=who)) for topic in (MODE, PLANT_STATE, estimate(node))} == {""}
 
 
 @given(NAMES)
@@ -93,7 +103,7 @@ def test_the_table_names_every_key_of_the_code() -> None:
     others = {
         alive("<who>"): "liveliness",
         session("<who>", "<id>"): "liveliness",
-        refused("<id>"): "a sentence",
+        refused("<who>", "<id>"): "a sentence",
         ready("<who>"): "Ready",
         CONTROL: "Control",
         ACKNOWLEDGED: "Acknowledged",

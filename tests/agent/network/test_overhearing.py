@@ -23,7 +23,7 @@ LISTENER = """
 import sys
 from agent.network.configuration import Network
 from agent.network.session import Session
-session = Session(Network(connect=(sys.argv[1],)), run="test", hand_over=lambda duty: None)
+session = Session(Network(connect=(sys.argv[1],)), run="test", who="viewer", hand_over=lambda duty: None)
 overheard = session.overhear()
 while True:
     sample = overheard.next()
@@ -33,7 +33,7 @@ while True:
 
 @pytest.fixture
 def publisher() -> Iterator[Session]:
-    with closing(Session(Network(), run="test", hand_over=lambda duty: None)) as session:
+    with closing(Session(Network(), run="test", who="plant", hand_over=lambda duty: None)) as session:
         for topic in (MODE, PLANT_STATE):
             session.advertise(topic, express=False)
         yield session
@@ -77,7 +77,7 @@ def test_one_that_stands_still_holds_up_nobody(publisher: Session, listener: sub
 def test_nothing_is_sent_to_nobody(publisher: Session) -> None:
     assert not any(publisher._watched.values())
     with closing(
-        Session(Network(connect=(publisher.locators()[0],)), run="test", hand_over=lambda duty: None)
+        Session(Network(connect=(publisher.locators()[0],)), run="test", who="viewer", hand_over=lambda duty: None)
     ) as other:
         taken = other.channel(MODE)
         deadline = time.monotonic() + PATIENCE
