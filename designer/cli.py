@@ -27,6 +27,7 @@ from designer.commands import (
     show,
     simulate,
     verify,
+    watch,
 )
 
 
@@ -54,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reproduce.add_reproduce(commands)
     show.add_show(commands)
     add_roles(commands)
+    watch.add_watch(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help(sys.stderr)

@@ -30,7 +30,7 @@ ROOMS = {
     "agent.signals": "",
     "agent.network": "agent.plan agent.signals",
     "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.inbox agent.network "
-    "agent.pacing agent.plan agent.receipts",
+    "agent.pacing agent.plan agent.receipts agent.signals",
     "agent.launch": "agent.contract.recording agent.plan agent.signals",
     "agent.commands": "agent.contract.recording agent.faults agent.launch agent.network agent.plan agent.roles",
     "agent.cli": "agent.commands",
@@ -58,11 +58,12 @@ ROOMS = {
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
+    "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
     "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
-    "designer.simulation designer.synthesis designer.what_if",
+    "designer.simulation designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
@@ -87,7 +88,7 @@ DOORS = {
     "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/"],
-    "rich": ["agent/commands/words.py", "designer/commands/"],
+    "rich": ["agent/commands/words.py", "designer/commands/", "designer/watch/table.py"],
     "distributed": ["designer/workers.py"],
 }
 

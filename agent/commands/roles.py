@@ -57,14 +57,15 @@ def _role(
 ) -> argparse.ArgumentParser:
     parser = add_command(commands, name, call, about)
     parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, the same for everybody")
-    _network_options(parser)
+    add_network_options(parser)
     return parser
 
 
-def _network_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--run", type=run_name, metavar="NAME", help="name of the run, the same for everybody (the problem's name)"
-    )
+def add_network_options(
+    parser: argparse.ArgumentParser, *, run: str = "name of the run, the same for everybody (the problem's name)"
+) -> None:
+    """Add how a process reaches the others, `network_of` reads it; `run` is the help of --run."""
+    parser.add_argument("--run", type=run_name, metavar="NAME", help=run)
     parser.add_argument(
         "--listen",
         default="tcp/127.0.0.1:0",
@@ -110,7 +111,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
     gains = load_gains(options.gains)
     plan = plan_of(options, gains)
     say = say_to_launcher if options.child else say_to_person
-    with Bus(_network(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
+    with Bus(network_of(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
         say({"listening": bus.locators()})
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
@@ -127,7 +128,7 @@ def recorder_command(options: argparse.Namespace) -> int:
     gains = load_gains(options.gains)
     run = options.run or gains.problem.name
     path = options.output or default_recording(run)
-    with Bus(_network(options), run=run, who=RECORDER) as bus:
+    with Bus(network_of(options), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
     print(f"recording  {parts.in_words(parts.files_of(path))}")
     return EXIT_GOOD
@@ -139,7 +140,7 @@ def live_command(options: argparse.Namespace) -> int:
 
     gains = load_gains(options.gains)
     viewer.run(
-        _network(options),
+        network_of(options),
         gains,
         run=options.run or gains.problem.name,
         host=options.host,
@@ -154,14 +155,15 @@ def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callab
     from agent.network.bus import Bus
 
     run = options.run or gains.problem.name
-    with Bus(_network(options), run=run, who=who) as bus:
+    with Bus(network_of(options), run=run, who=who) as bus:
         if not options.child:
             print(f'{in_words(who)} waits for everybody of run "{run}"', file=sys.stderr)
         role(bus)
     return EXIT_GOOD
 
 
-def _network(options: argparse.Namespace) -> Network:
+def network_of(options: argparse.Namespace) -> Network:
+    """What the options of `add_network_options` ask for."""
     from agent.network.configuration import Network
 
     connect = tuple(options.connect)

@@ -61,9 +61,9 @@ def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], No
         def show(word: dict[str, Any]) -> None:
             warn(word)
             if "listening" in word:
-                bar.console.print(
-                    f"look on with: {live} --connect {word['listening'][0]}", highlight=False, soft_wrap=True
-                )
+                address = f"--connect {word['listening'][0]}"
+                for what, command in (("look on with", "peakmesh watch"), ("in Foxglove", live)):
+                    bar.console.print(f"{what}: {command} {address}", highlight=False, soft_wrap=True)
             elif "started" in word:
                 bar.update(task, description="steps")
             elif "complete" in word:

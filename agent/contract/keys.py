@@ -23,6 +23,7 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
+| facts                  | queryable   | recorder: Facts            | viewers: what run this is                  |
 | watch/<data topic>     | the same    | publishers, to viewers     | viewers, where there are any, without stamp|
 
 The recorder writes one more topic to the file, which is never on the wire:
@@ -63,6 +64,11 @@ def speaker_of(key_expression: str) -> str:
     """Who speaks under a key of a topic that several share; "" for any other key: `sender_of` its topic does."""
     topic, _, who = key_expression.split("/", 2)[2].rpartition("/")
     return who if _is_shared(topic) else ""
+
+
+def run_of(key_expression: str) -> str:
+    """The run that a key is of."""
+    return key_expression.split("/", 2)[1]
 
 
 # data
@@ -120,7 +126,7 @@ def decode(topic: str, payload: bytes) -> Message:
 
 
 # what runs the run
-CONTROL, ACKNOWLEDGED = "control", "acknowledged"
+CONTROL, ACKNOWLEDGED, FACTS = "control", "acknowledged", "facts"
 
 
 def alive(who: str) -> str:

@@ -179,6 +179,13 @@ class Control(Frozen):
     faults: list[str] = Field(default=[])
 
 
+class Facts(Frozen):
+    """What a viewer is told who asks what run this is: the order that it started by, and its gains file."""
+
+    start: Control
+    gains: str
+
+
 class BrokenOff(Frozen):
     """The recording could not be written any more, because `reason`; it holds every step < `steps`.
 

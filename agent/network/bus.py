@@ -23,8 +23,8 @@ from typing import NoReturn, Self, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from agent.contract.errors import InputError, Interrupted, RunBroken, first_fault
-from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, RECORDER, in_words, model_of, ready, refused
-from agent.contract.messages import Acknowledged, Control, Estimate, Message, Ready
+from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, FACTS, RECORDER, in_words, model_of, ready, refused
+from agent.contract.messages import Acknowledged, Control, Estimate, Facts, Message, Ready
 from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
@@ -309,6 +309,10 @@ class Bus:
     def acknowledge(self, acknowledged: Acknowledged) -> None:
         """The recorder's word to everybody."""
         self._say(ACKNOWLEDGED, acknowledged)
+
+    def tell_viewers(self, facts: Facts) -> None:
+        """The recorder's: answer viewers who ask what run this is. It has no deadlines that this could cost."""
+        self._session.answer(FACTS, facts.model_dump_json().encode())
 
     def request_replay(self, who: str, *, first: int) -> None:
         """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""

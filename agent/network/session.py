@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import alive, key, replay, session, speaker_of, topic_of, watch
+from agent.contract.keys import COORDINATOR, alive, key, replay, run_of, session, speaker_of, topic_of, watch
 from agent.contract.messages import Stamp
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
@@ -126,6 +126,36 @@ class Session:
             consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
             timeout=seconds,
         )
+
+    def answer(self, topic: str, payload: bytes) -> None:
+        """Answer whoever asks on `topic` with these bytes, from now on."""
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                query.reply(key(self._run, topic), payload)
+
+        self._declared.append(
+            self._zenoh.declare_queryable(key(self._run, topic), lambda query: self._hand_over(lambda: reply(query)))
+        )
+
+    def ask(self, topic: str, decode: Callable[[bytes], Incoming | None], *, seconds: float) -> None:
+        """Have whatever is answered on `topic` decoded."""
+
+        def hear(reply: zenoh.Reply) -> None:
+            if (sample := reply.ok) is not None:
+                self._hand_over(lambda: decode(sample.payload.to_bytes()))
+
+        self._zenoh.get(key(self._run, topic), hear, timeout=seconds)
+
+    def watch_runs(self, found: Callable[[str], None]) -> None:
+        """Have every run named whose coordinator is there, whatever run this session is for; on Zenoh's threads."""
+
+        def see(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                found(run_of(str(sample.key_expr)))
+
+        liveliness = self._zenoh.liveliness()
+        self._declared.append(liveliness.declare_subscriber(key("*", alive(COORDINATOR)), see, history=True))
 
     # Words that run the run.
     def listen(self, topic: str, decode: Callable[[bytes], Incoming]) -> None:

@@ -12,7 +12,7 @@ from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
 from agent.contract.errors import InputError
-from agent.contract.messages import Acknowledged, Control, Ready, Stamp
+from agent.contract.messages import Acknowledged, Control, Facts, Ready, Stamp
 
 
 class Sample(NamedTuple):
@@ -42,7 +42,7 @@ class Replayed(NamedTuple):
     who: str
 
 
-Incoming = Sample | Peer | Namesake | Control | Acknowledged | Ready | Replayed
+Incoming = Sample | Peer | Namesake | Control | Acknowledged | Ready | Replayed | Facts
 Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
 T = TypeVar("T")
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from agent.contract.errors import Interrupted, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT_STATE, RECORDER, decode, estimate, measurement, sender_of
-from agent.contract.messages import Acknowledged, BrokenOff, Control, Ready
+from agent.contract.messages import Acknowledged, BrokenOff, Control, Facts, Ready
 from agent.contract.recording.parts import refuse_recording
 from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import Split
@@ -50,6 +50,7 @@ def run(
     topics = [MODE, PLANT_STATE, EVENT, ACCOUNT, *map(measurement, names), *map(estimate, names)]
     channels = {topic: bus.channel(topic) for topic in topics}
     start = join(bus, gains)
+    bus.tell_viewers(Facts(start=start, gains=gains.canonical().decode()))
     split = Split(plan.split_size, plan.split_seconds)
     if cut is not None and cut.run.get("identity") != start.identity:
         refuse_recording(path, force=force)

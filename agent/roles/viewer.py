@@ -1,27 +1,25 @@
-"""The viewer: shows a running network to Foxglove. It only listens: a run is the same with and without it.
+"""The viewer: shows a running network to Foxglove. It only looks on (`onlooker`): a run is the same without it.
 
-Publishers send to it what it has time for, so that it holds up nobody, even where it stands still; Foxglove's server,
-too, drops what a client is too slow for. So it is never used for recording.
+Foxglove's server, too, drops what a client is too slow for.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
-from agent.contract.errors import InputError, Interrupted, RunBroken
+from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, EVENT, VIEWER, data_topics, model_of
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
 from agent.network.words import ChannelClosed, Words
+from agent.roles.onlooker import stopped_by_signals, wait_for_coordinator
 
 
 def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: Callable[[str], None]) -> None:
@@ -30,23 +28,15 @@ def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: 
     Raises RunBroken where the run is not there within `network.wait` seconds, InputError where the port is taken.
     """
     words = Words("")
-    with _stopped_by_signals(), closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session:
+    with stopped_by_signals(), closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session:
         overheard = session.overhear()
         with _server(gains, run, host, port) as (address, show):
             say(address)
             session.watch()
-            _wait_for_coordinator(words, run, network.wait)
+            wait_for_coordinator(words, run, network.wait)
             threading.Thread(target=_pass_on, args=(overheard, show), daemon=True).start()
             while COORDINATOR in words.present:
                 words.take(math.inf)
-
-
-def _wait_for_coordinator(words: Words, run: str, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while COORDINATOR not in words.present:
-        if time.monotonic() >= deadline:
-            raise RunBroken(f'the coordinator of run "{run}" was not found within {seconds:g} s')
-        words.take(deadline)
 
 
 def _pass_on(overheard: Channel, show: Callable[[str, bytes], None]) -> None:
@@ -94,16 +84,3 @@ def _channel(foxglove: Any, topic: str, context: Any) -> Any:
         message_encoding="json",
         context=context,
     )
-
-
-@contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise Interrupted(number)
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

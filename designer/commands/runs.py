@@ -7,6 +7,7 @@ import json
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import agent.commands.run
 from agent.commands.options import (
@@ -14,6 +15,7 @@ from agent.commands.options import (
     add_command,
     add_recording_options,
     default_recording,
+    load_gains,
     recording_plan_of,
 )
 from agent.commands.words import run_text
@@ -85,8 +87,8 @@ def run_command(options: argparse.Namespace) -> int:
         for option in ("method", "budget"):
             if getattr(options, option) is not None:
                 raise InputError(f"--{option} says how to design a problem; {path} has its gains already")
-        options.gains = path
-        return agent.commands.run.run_command(options)
+        ran = agent.commands.run.run_gains(path, load_gains(path), options, recording_plan_of(options))
+        return _tell(ran, options)
     from agent.contract.recording.parts import refuse_recording
     from designer.ladder import rounded_up
     from designer.problems import find
@@ -99,5 +101,18 @@ def run_command(options: argparse.Namespace) -> int:
     gains, _ = design_and_save(problem, options.method, path, force=options.force, budget=options.budget)
     print(f"designed {path}, gamma = {rounded_up(gains.certificate.gamma)}", file=sys.stderr)
     ran = agent.commands.run.run_gains(path, gains, options, recording_plan_of(options))
-    print(json.dumps({"gains": str(path), **ran}) if options.json else f"{run_text(ran)}\ngains      {path}")
+    return _tell({"gains": str(path), **ran}, options)
+
+
+def _tell(ran: dict[str, Any], options: argparse.Namespace) -> int:
+    """How the run went; of a paced one, what the bound says of it, too, which its recording tells."""
+    lines = [run_text(ran)]
+    if "pacing" in ran and not ran["broken_off"]:
+        from designer.replay import ledger
+
+        account = ledger([Path(part) for part in ran["parts"]])
+        ran["ledger"] = account.document() if account is not None else None
+        lines += [f"ledger     {account.text()}" if account is not None else "ledger     none: gamma is not proved"]
+    lines += [f"gains      {ran['gains']}"] if "gains" in ran else []
+    print(json.dumps(ran) if options.json else "\n".join(lines))
     return agent.commands.run.exit_code_of(ran)

@@ -27,6 +27,7 @@ class Deviation(NamedTuple):
 
 
 AS_DESIGNED = Deviation()
+_MOST = 512  # deviations of which the models are kept
 
 
 class Acting(NamedTuple):
@@ -67,6 +68,9 @@ class Models:
 
     def acting(self, deviation: Deviation) -> Acting:
         """What acts. Raises Unabsorbed where a node begins with 0 and the errors do not know x."""
+        if len(self._known) > _MOST:  # a run may go on for ever, with ever other faults
+            self._known.clear()
+            self._operators.clear()
         if deviation not in self._known:
             self._known[deviation] = Acting(self._operator(deviation), self._J(deviation), self._MM(deviation))
         return self._known[deviation]

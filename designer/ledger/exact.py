@@ -77,6 +77,13 @@ class Ledger:
             P = lyapunov_matrix(gains)
         return cls(gains.problem, K_bar, H_bar, gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
 
+    def anew(self, k: int) -> Ledger:
+        """One of the same network that stands at step k, and has been told nothing."""
+        models = self.models
+        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._set.P)
+        other.models, other.k = models, k  # the models that were made
+        return other
+
     # what it is told
     def tell(self, deviation: Deviation) -> None:
         """What happens in this step, from its first moment on. What no model describes makes the bound void."""

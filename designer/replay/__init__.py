@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.problem import Problem
+from designer.ledger.account import Account
 from designer.ledger.deviation import Deviation
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
@@ -106,6 +107,21 @@ def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, rep
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
         compared = _compare(log, central, tally, report or (lambda what, done, of: None))
     return _verdict(log, tally, compared)
+
+
+def ledger(path: FilePath | Sequence[FilePath]) -> Account | None:
+    """What gamma says of a recorded run; as `replay` says it, but that what nodes tell of themselves is not compared.
+
+    None where no gamma is proved.
+    """
+    log = load(path)
+    faults: Mapping[int, Deviation] = {}
+    if log.is_paced:
+        central = Central.of(log.gains)
+        drawn = draw(log, central)
+        inputs, hears = logged_inputs(log, central, drawn), proofs.to_be_heard(log, central, drawn)
+        faults = faults_of(Coupling.of(with_the_plant(log, drawn), central, inputs, drawn, hears), hears)
+    return promise(log, checked_gamma(log.gains), faults)
 
 
 class Tally:

@@ -1,0 +1,135 @@
+"""Whoever looks on: hears what a run publishes, who is there, and what run it is. It takes no part in it.
+
+Publishers send to it what it has time for, so that it holds up nobody, even where it stands still. So it may miss
+messages, and is never used for recording.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from queue import Empty, SimpleQueue
+from types import FrameType
+from typing import NoReturn
+
+from pydantic import ValidationError
+
+from agent.contract.errors import InputError, Interrupted, RunBroken, listed
+from agent.contract.keys import COORDINATOR, FACTS
+from agent.contract.messages import Facts
+from agent.network.arrivals import Arrival, Arrivals
+from agent.network.configuration import Network
+from agent.network.session import Channel, Session
+from agent.network.words import Peer, Words
+from agent.signals import heed, restore
+
+ASK_SECONDS = 1.0  # what is not answered by then is asked again
+AMONG_SECONDS = 0.2  # after the first run that is found, others have so long to show themselves
+
+
+class Onlooker:
+    """Looks on at one run, from the moment at which its coordinator was found."""
+
+    def __init__(self, session: Session, words: Words, heard: Channel, run: str) -> None:
+        self.run = run
+        self.facts: Facts | None = None  # what run this is, as soon as somebody has answered
+        self._session, self._words = session, words
+        self._arrivals = Arrivals([heard])
+        self._asked = -ASK_SECONDS
+
+    def until(self, deadline: float) -> Iterator[Arrival]:
+        """What was published, with the time at which it arrived here; ends at the deadline, by time.monotonic()."""
+        while time.monotonic() < deadline:
+            yield from self._arrivals.until(deadline)
+
+    def news(self) -> Iterator[Peer]:
+        """Who has come and gone since this was asked last; it asks for the facts, too, until there is an answer."""
+        now = time.monotonic()
+        if self.facts is None and now >= self._asked + ASK_SECONDS:
+            self._asked = now
+            self._session.ask(FACTS, _facts, seconds=ASK_SECONDS)
+        taken = -1
+        while self._words.taken != taken:
+            taken = self._words.taken
+            match self._words.take(now):
+                case Peer() as peer:
+                    yield peer
+                case Facts() as facts:
+                    self.facts = facts
+
+    @property
+    def present(self) -> set[str]:
+        """Who takes part just now."""
+        return self._words.present
+
+
+@contextmanager
+def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
+    """Look on at `run`, or at the one run that is there; a signal ends it as Interrupted.
+
+    Raises RunBroken where there is none within `network.wait` seconds, InputError where there are several.
+    """
+    with stopped_by_signals():
+        name = find_run(network) if run is None else run
+        words = Words("")
+        with closing(Session(network, run=name, hand_over=words.put)) as session:
+            heard = session.overhear()
+            session.watch()
+            wait_for_coordinator(words, name, network.wait)
+            yield Onlooker(session, words, heard, name)
+
+
+def find_run(network: Network) -> str:
+    """The name of the only run on this network."""
+    found: SimpleQueue[str] = SimpleQueue()
+    with closing(Session(network, run="", hand_over=lambda duty: None)) as session:
+        session.watch_runs(found.put)
+        try:
+            names = {found.get(timeout=network.wait)}
+        except Empty:
+            where = ", ".join(network.connect)
+            raise RunBroken(f"no run was found at {where} within {network.wait:g} s") from None
+        deadline = time.monotonic() + AMONG_SECONDS
+        while (left := deadline - time.monotonic()) > 0.0:
+            try:
+                names.add(found.get(timeout=left))
+            except Empty:
+                break
+    if len(names) > 1:
+        raise InputError(f"there are the runs {listed(sorted(names))}; choose one with --run")
+    return names.pop()
+
+
+def wait_for_coordinator(words: Words, run: str, seconds: float) -> None:
+    """Until it is there; RunBroken where that takes longer."""
+    deadline = time.monotonic() + seconds
+    while COORDINATOR not in words.present:
+        if time.monotonic() >= deadline:
+            raise RunBroken(f'the coordinator of run "{run}" was not found within {seconds:g} s')
+        words.take(deadline)
+
+
+@contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Signals that ask for an end raise Interrupted; a terminal that is closed is one."""
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise Interrupted(number)
+
+    before = heed(stop)
+    if signal.SIGHUP not in before and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, stop)
+    try:
+        yield
+    finally:
+        restore(before)
+
+
+def _facts(payload: bytes) -> Facts | None:
+    """None for what is not peakmesh's: somebody else may answer too."""
+    try:
+        return Facts.model_validate_json(payload)
+    except ValidationError:
+        return None
