@@ -103,7 +103,7 @@ class Event(Message):
 
 
 class Account(Message):
-    """What node `who` did in a paced run up to step k: once soon after its beginning, and at its end.
+    """What node `who` did in a paced run up to step k: now and then, and at its end.
 
     Latencies are from a measurement's arrival to the estimate with it, and from a tick to the next estimate.
     """

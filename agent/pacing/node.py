@@ -28,7 +28,7 @@ from agent.pacing.reasons import Reasons
 from agent.pacing.spread import Spread
 from agent.plan import LARGEST_WINDOW, Pace
 
-EARLY_STEPS, EARLY_SECONDS = 30, 1.0  # after both, a node tells how it goes
+TELL_STEPS, TELL_SECONDS = 30, 1.0  # after both, a node tells how it goes, again and again
 PATIENCE = 1.0  # seconds, after which a message that is waited for no more counts as silent
 
 
@@ -68,14 +68,14 @@ class PacedNode:
         self._reasons = Reasons(self._who, patience=max(PATIENCE, 2.0 * pace.period))
         self._to_estimate, self._to_step = Spread(), Spread()
         self._made = self._pairs = self._pairs_missed = self._measurements_missed = self._late = 0
-        self._first_tick, self._has_told = math.inf, False
+        self._told_at: tuple[int, float] | None = None  # steps made, and when: of its last account, or the beginning
         self.done = False
 
     def take(self, sender: str, message: Message, at: float) -> None:
         """Take in what arrived at `at`; `sender` is the node that an estimate is from."""
         arrived = _Arrived(sender, message, at)
         if isinstance(message, Mode):
-            self._first_tick = min(self._first_tick, at)
+            self._told_at = self._told_at or (0, at)
             if self._k <= message.step < self._steps:
                 self._ticks.setdefault(message.step, arrived)
             return
@@ -107,12 +107,18 @@ class PacedNode:
             yield from self._hear(wanted, now)
         is_over = self._k == self._steps
         yield from self._reasons.events(now, step=min(self._k, self._steps - 1), hurry=is_over)
-        if not self._has_told and self._made >= EARLY_STEPS and now >= self._first_tick + EARLY_SECONDS:
-            self._has_told = True
+        if not is_over and self._is_to_tell(now):
+            self._told_at = self._made, now
             yield self._account(self._k - 1)
         if is_over and self._reasons.due == math.inf and not self.done:
             self.done = True
             yield self._account(self._steps - 1)
+
+    def _is_to_tell(self, now: float) -> bool:
+        if self._told_at is None:
+            return False
+        made, at = self._told_at
+        return self._made >= made + TELL_STEPS and now >= at + TELL_SECONDS
 
     def published(self, message: Message, at: float) -> None:
         """`message` of `advance` went out at `at`."""

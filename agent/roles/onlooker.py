@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from contextlib import closing, contextmanager
 from queue import Empty, SimpleQueue
 from types import FrameType
@@ -22,7 +22,7 @@ from agent.contract.messages import Facts
 from agent.network.arrivals import Arrival, Arrivals
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
-from agent.network.words import Peer, Words
+from agent.network.words import Words
 from agent.signals import heed, restore
 
 ASK_SECONDS = 1.0  # what is not answered by then is asked again
@@ -44,8 +44,8 @@ class Onlooker:
         while time.monotonic() < deadline:
             yield from self._arrivals.until(deadline)
 
-    def news(self) -> Iterator[Peer]:
-        """Who has come and gone since this was asked last; it asks for the facts, too, until there is an answer."""
+    def heed(self) -> None:
+        """Note who has come and gone, and what is answered; it asks for the facts until there is an answer."""
         now = time.monotonic()
         if self.facts is None and now >= self._asked + ASK_SECONDS:
             self._asked = now
@@ -54,14 +54,12 @@ class Onlooker:
         while self._words.taken != taken:
             taken = self._words.taken
             match self._words.take(now):
-                case Peer() as peer:
-                    yield peer
                 case Facts() as facts:
                     self.facts = facts
 
     @property
-    def present(self) -> set[str]:
-        """Who takes part just now."""
+    def present(self) -> Set[str]:
+        """Who takes part just now, as far as was heeded."""
         return self._words.present
 
 

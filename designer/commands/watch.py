@@ -57,7 +57,7 @@ def _watch(onlooker: Onlooker, scene: Scene, show: Show, *, once: bool, wait: fl
         _take_in(onlooker, scene, time.monotonic() + FRAME_SECONDS, digest)
         now = time.monotonic()
         scene.settle(now, _after(LEDGER_SECONDS))
-        over = scene.leave(onlooker.present)
+        over = scene.is_over()
         is_all = over or (once and (scene.is_complete or now >= began + ONCE_SECONDS))
         if is_all or not once:
             show(scene.seen())
@@ -83,8 +83,8 @@ def _take_in(onlooker: Onlooker, scene: Scene, deadline: float, digest: str) -> 
             scene.hear(sample.topic, decode(sample.topic, sample.payload), at)
         except RunBroken:  # somebody says what is no message
             scene.unreadable += 1
-    for peer in onlooker.news():
-        scene.peer(peer.who, peer.present)
+    onlooker.heed()
+    scene.present(onlooker.present)
     if scene.gains is None and onlooker.facts is not None:
         _learn(onlooker, scene, digest)
 

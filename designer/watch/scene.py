@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -124,10 +124,11 @@ class Scene:
         for name in gains.problem.node_names:
             self._node(name)
 
-    def peer(self, who: str, present: bool) -> None:
-        """Somebody has come or gone."""
-        (self._there.add if present else self._there.discard)(who)
-        (self._gone.discard if present else self._gone.add)(who)
+    def present(self, there: Iterable[str]) -> None:
+        """Who takes part just now."""
+        now = set(there)
+        self._gone = (self._gone | self._there) - now
+        self._there = now
 
     def hear(self, topic: str, message: Message, at: float) -> None:
         """A message that arrived at `at`."""
@@ -199,9 +200,9 @@ class Scene:
         known = self._step is not None and bool(self._no_book or (self._book and self._book.promise))
         return known and all(node.step is not None for node in nodes)
 
-    def leave(self, there: Collection[str]) -> bool:
-        """Whether the run is over, with `there` still there."""
-        if COORDINATOR in there or (self.ended is None and there):
+    def is_over(self) -> bool:
+        """Whether the run has ended: its coordinator has said so and gone, or everybody has left."""
+        if COORDINATOR in self._there or (self.ended is None and self._there):
             return False
         self.ended = self.ended or "everybody has left"
         return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Literal
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -13,12 +14,25 @@ from designer.watch.scene import NodeSeen, Seen
 SHOWN = 8  # events that a terminal shows
 BEHIND = 2  # steps by which a node may be behind the clock
 COLOURS = {"valid": "green", "valid plus": "yellow", "void": "bold red", "none": "yellow"}
+COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
+    ("node", "left"),
+    ("step", "right"),
+    ("tick to estimate\nnow, most (ms)", "right"),  # as seen here
+    ("tick to step, told\nmedian, 99 %, most (ms)", "right"),
+    ("heard", "left"),
+    ("measured", "left"),
+    ("innovation", "right"),
+    ("error\nnow", "right"),
+    ("\nmost", "right"),
+    ("substituted\npairs", "right"),
+    ("\nmeasurements", "right"),
+)
 ALARMS = {"late", "silent", "gone", "began", "fault", "stop", "stood", "unrecorded"}  # kinds of events
 
 
 def table(seen: Seen) -> RenderableType:
     """All of it, as wide as the terminal is."""
-    return Group(_head(seen), _nodes(seen), *_below(seen))
+    return Group(_head(seen), Text(), _nodes(seen), Text(), *_below(seen))
 
 
 def lines(seen: Seen, *, after: int = -1) -> Iterator[str]:
@@ -59,8 +73,8 @@ def _where(seen: Seen) -> str:
 
 def _nodes(seen: Seen) -> Table:
     drawn = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 3, 0, 0))
-    for name in ("node", "step", "delay", "heard", "measured", "|innovation|", "|error|", "most", "substituted"):
-        drawn.add_column(name, justify="left" if name in ("node", "heard", "measured") else "right", no_wrap=True)
+    for name, justify in COLUMNS:
+        drawn.add_column(name, justify=justify)
     for node in seen.nodes:
         drawn.add_row(*_row(node, seen))
     return drawn
@@ -73,26 +87,25 @@ def _row(node: NodeSeen, seen: Seen) -> Iterator[Text]:
         yield Text(_word(node.step), style="yellow" if behind else "")
     else:
         yield Text("gone" if node.step is None else f"gone at {node.step}", style="red")
-    delay, longest = (_number(None if one is None else 1e3 * one, ".1f") for one in (node.delay, node.longest_delay))
-    yield Text(delay if node.delay is None else f"{delay} ms, most {longest}")
+    yield Text(_milliseconds(node.delay, node.longest_delay))
+    yield Text(_milliseconds(node.to_step_median, node.to_step_p99, node.to_step_max))
     heard = Text(" ".join(node.heard) or ("" if node.step is None else "nobody"))
-    for name in node.not_heard or ():
-        heard.append(" ").append(name, style="strike red")
-    yield heard
+    yield heard.append(f" not {' '.join(node.not_heard)}" if node.not_heard else "", style="red")
     yield Text({True: "yes", False: "no", None: ""}[node.measured], style="" if node.measured else "red")
     for number in (node.innovation, node.error, node.largest_error):
         yield Text(_number(number, ".3g"))
-    missed = node.pairs_substituted, node.measurements_substituted
-    yield Text(f"{missed[0]} + {missed[1]}", style="yellow" if any(missed) else "dim")
+    for missed in (node.pairs_substituted, node.measurements_substituted):
+        yield Text(str(missed), style="yellow" if missed else "dim")
 
 
 def _below(seen: Seen) -> Iterator[RenderableType]:
     status = seen.ledger["status"] if seen.ledger else "none"
     yield Text(_ledger(seen), style=COLOURS[status])
     yield Text(_substituted(seen) + (f"; gone: {', '.join(seen.gone)}" if seen.gone else ""))
+    yield Text()
     for told in seen.events[-SHOWN:]:
         style = COLOURS["void"] if "void" in told.text and told.kind == "ledger" else ""
-        line = Text(f"{told.step:>9}  ", style="dim")
+        line = Text.assemble((f"{told.step:>9}  ", "dim"))
         line.append(f"{told.kind:<8}", style="yellow" if told.kind in ALARMS else "cyan")
         yield line.append(f"  {told.text}", style=style)
     if seen.ended is not None:
@@ -119,6 +132,10 @@ def _substituted(seen: Seen) -> str:
 
 def _largest(seen: Seen) -> float | None:
     return max((node.error for node in seen.nodes if node.error is not None), default=None)
+
+
+def _milliseconds(*seconds: float | None) -> str:
+    return ", ".join(f"{1e3 * one:.1f}" for one in seconds if one is not None)
 
 
 def _word(value: object) -> str:
