@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from designer.watch.scene import NodeSeen, Seen
 
 SHOWN = 8  # events that a terminal shows
+AROUND = 10  # lines of a terminal for what is neither a node nor an event
 BEHIND = 2  # steps by which a node may be behind the clock
 COLOURS = {"valid": "green", "valid plus": "yellow", "void": "bold red", "none": "yellow"}
-COLUMNS: tuple[tuple[str, Literal["left", "right"]], ...] = (
-    ("node", "left"),
-    ("step", "right"),
-    ("tick to estimate\nnow, most (ms)", "right"),  # as seen here
-    ("tick to step, told\nmedian, 99 %, most (ms)", "right"),
-    ("heard", "left"),
-    ("measured", "left"),
-    ("innovation", "right"),
-    ("error\nnow", "right"),
-    ("\nmost", "right"),
-    ("substituted\npairs", "right"),
-    ("\nmeasurements", "right"),
-)
 ALARMS = {"late", "silent", "gone", "began", "fault", "stop", "stood", "unrecorded"}  # kinds of events
 
 
 def table(seen: Seen) -> RenderableType:
-    """All of it, as wide as the terminal is."""
-    return Group(_head(seen), Text(), _nodes(seen), Text(), *_below(seen))
+    """All of it, as wide and high as the terminal is."""
+    return Group(_head(seen), Text(), _Nodes(seen), Text(), *_events(seen))
 
 
 def lines(seen: Seen, *, after: int = -1) -> Iterator[str]:
@@ -41,16 +30,16 @@ def lines(seen: Seen, *, after: int = -1) -> Iterator[str]:
         if told.number > after:
             yield f"  step {told.step}  {told.kind}: {told.text}"
     there = [node for node in seen.nodes if node.there]
+    largest = max((node.error for node in seen.nodes if node.error is not None), default=None)
     words = [
         _where(seen),
-        f"mode {_word(seen.mode)}",
         f"{_number(seen.steps_per_second, '.1f')} steps/s",
         f"{len(there)} of {len(seen.nodes)} nodes",
         _substituted(seen),
-        f"|error| at most {_number(_largest(seen), '.3g')}",
+        f"error at most {_number(largest, '.3g')}",
         _ledger(seen),
     ]
-    yield "; ".join(words)
+    yield "; ".join(filter(None, words))
 
 
 def _head(seen: Seen) -> Text:
@@ -58,56 +47,107 @@ def _head(seen: Seen) -> Text:
     facts = [f"run {seen.run}", kind, "" if seen.seed is None else f"seed {seen.seed}"]
     rates = [
         _where(seen),
-        f"mode {_word(seen.mode)}",
         f"{_number(seen.steps_per_second, '.1f')} steps/s",
         f"{_number(seen.messages_per_second, '.0f')} messages/s",
         f"watched since step {_word(seen.watched_since)}",
     ]
-    text = Text("   ".join(filter(None, facts)), style="bold")
-    return text.append("\n" + "   ".join(rates), style="not bold")
+    text = Text()
+    text.append("   ".join(filter(None, facts)), style="bold").append("\n" + "   ".join(rates))
+    text.append(f"\n{_ledger(seen)}", style=COLOURS[seen.ledger["status"] if seen.ledger else "none"])
+    below = _substituted(seen), f"gone: {', '.join(seen.gone)}" if seen.gone else ""
+    return text.append("\n" + "; ".join(filter(None, below)))
 
 
 def _where(seen: Seen) -> str:
-    return f"step {_word(seen.step)}" + (f" of {seen.steps}" if seen.steps is not None else "")
+    of = "" if seen.steps is None else f" of {seen.steps}"
+    return f"step {_word(seen.step)}{of}, mode {_word(seen.mode)}"
 
 
-def _nodes(seen: Seen) -> Table:
-    drawn = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 3, 0, 0))
-    for name, justify in COLUMNS:
-        drawn.add_column(name, justify=justify)
-    for node in seen.nodes:
-        drawn.add_row(*_row(node, seen))
-    return drawn
+class _Column(NamedTuple):
+    name: str
+    cell: Callable[[NodeSeen, Seen], Text]
+    justify: Literal["left", "right"] = "right"
+    from_width: int = 0  # of the terminal
 
 
-def _row(node: NodeSeen, seen: Seen) -> Iterator[Text]:
-    behind = bool(seen.period) and node.step is not None and seen.step is not None and node.step < seen.step - BEHIND
-    yield Text(node.name, style="bold" if node.there else "bold red")
-    if node.there:
-        yield Text(_word(node.step), style="yellow" if behind else "")
-    else:
-        yield Text("gone" if node.step is None else f"gone at {node.step}", style="red")
-    yield Text(_milliseconds(node.delay, node.longest_delay))
-    yield Text(_milliseconds(node.to_step_median, node.to_step_p99, node.to_step_max))
+@dataclass
+class _Nodes:
+    """A line for each node; where there are too many, those in trouble first."""
+
+    seen: Seen
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        drawn = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+        columns = [column for column in COLUMNS if column.from_width <= options.max_width]
+        for column in columns:
+            drawn.add_column(column.name, justify=column.justify, no_wrap=column.name != "heard")
+        most = max(1, console.height - AROUND - SHOWN) if console.is_terminal else len(self.seen.nodes)
+        nodes = self.seen.nodes
+        if len(nodes) > most:
+            nodes = sorted(nodes, key=lambda node: not _is_in_trouble(node, self.seen))[:most]
+        for node in nodes:
+            drawn.add_row(*(column.cell(node, self.seen) for column in columns))
+        yield drawn
+        if len(nodes) < len(self.seen.nodes):
+            yield Text(f"and {len(self.seen.nodes) - len(nodes)} more", style="dim")
+
+
+def _is_in_trouble(node: NodeSeen, seen: Seen) -> bool:
+    return not node.there or _is_behind(node, seen) or bool(node.not_heard) or node.measured is False
+
+
+def _is_behind(node: NodeSeen, seen: Seen) -> bool:
+    return bool(seen.period) and node.step is not None and seen.step is not None and node.step < seen.step - BEHIND
+
+
+def _step(node: NodeSeen, seen: Seen) -> Text:
+    if not node.there:
+        return Text("gone" if node.step is None else f"gone at {node.step}", style="red")
+    return Text(_word(node.step), style="yellow" if _is_behind(node, seen) else "")
+
+
+def _heard(node: NodeSeen, seen: Seen) -> Text:
     heard = Text(" ".join(node.heard) or ("" if node.step is None else "nobody"))
-    yield heard.append(f" not {' '.join(node.not_heard)}" if node.not_heard else "", style="red")
-    yield Text({True: "yes", False: "no", None: ""}[node.measured], style="" if node.measured else "red")
-    for number in (node.innovation, node.error, node.largest_error):
-        yield Text(_number(number, ".3g"))
-    for missed in (node.pairs_substituted, node.measurements_substituted):
-        yield Text(str(missed), style="yellow" if missed else "dim")
+    return heard.append(f" not {' '.join(node.not_heard)}" if node.not_heard else "", style="red")
 
 
-def _below(seen: Seen) -> Iterator[RenderableType]:
-    status = seen.ledger["status"] if seen.ledger else "none"
-    yield Text(_ledger(seen), style=COLOURS[status])
-    yield Text(_substituted(seen) + (f"; gone: {', '.join(seen.gone)}" if seen.gone else ""))
-    yield Text()
+def _measured(node: NodeSeen, seen: Seen) -> Text:
+    return Text({True: "yes", False: "no", None: ""}[node.measured], style="" if node.measured else "red")
+
+
+def _missed(node: NodeSeen, seen: Seen) -> Text:
+    missed = node.pairs_substituted, node.measurements_substituted
+    return Text("{} + {}".format(*missed), style="yellow" if any(missed) else "dim")
+
+
+def _milliseconds(*seconds: float | None) -> Text:
+    return Text(" / ".join(f"{1e3 * one:.1f}" for one in seconds if one is not None))
+
+
+COLUMNS = (
+    _Column("node", lambda node, seen: Text(node.name, style="bold" if node.there else "bold red"), "left"),
+    _Column("step", _step),
+    _Column("delay, ms\nnow / most", lambda node, seen: _milliseconds(node.delay, node.longest_delay)),
+    _Column(
+        "tick to step, ms\nmedian / 99% / most",
+        lambda node, seen: _milliseconds(node.to_step_median, node.to_step_p99, node.to_step_max),
+        from_width=120,
+    ),
+    _Column("heard", _heard, "left"),
+    _Column("measured", _measured, "left"),
+    _Column("innovation", lambda node, seen: Text(_number(node.innovation, ".3g"))),
+    _Column("error", lambda node, seen: Text(_number(node.error, ".3g"))),
+    _Column("error\nmost", lambda node, seen: Text(_number(node.largest_error, ".3g")), from_width=90),
+    _Column("substituted\npairs + y", _missed),
+)
+
+
+def _events(seen: Seen) -> Iterator[RenderableType]:
     for told in seen.events[-SHOWN:]:
-        style = COLOURS["void"] if "void" in told.text and told.kind == "ledger" else ""
-        line = Text.assemble((f"{told.step:>9}  ", "dim"))
+        line = Text(no_wrap=True, overflow="ellipsis")
+        line.append(f"{told.step:>9}  ", style="dim")
         line.append(f"{told.kind:<8}", style="yellow" if told.kind in ALARMS else "cyan")
-        yield line.append(f"  {told.text}", style=style)
+        yield line.append(f"  {told.text}")
     if seen.ended is not None:
         yield Text(f"the run has ended: {seen.ended}", style="bold")
 
@@ -117,25 +157,16 @@ def _ledger(seen: Seen) -> str:
         return "ledger not known yet"
     if "step" not in seen.ledger:
         return f"ledger {seen.ledger['text']}"
-    return f"ledger {seen.ledger['text']}, at step {seen.ledger['step']}"
+    since = f", seen from step {seen.ledger['since']} on" if seen.ledger["since"] else ""
+    return f"ledger at step {seen.ledger['step']}{since}: {seen.ledger['text']}"
 
 
 def _substituted(seen: Seen) -> str:
     if seen.period is not None and not seen.period:
-        return "nothing is substituted in lock-step"
+        return ""  # nothing is, in lock-step
     why = ", ".join(f"{count} {kind}" for kind, count in seen.reasons.items())
-    return (
-        f"substituted {seen.pairs_substituted} pairs, {seen.measurements_substituted} measurements"
-        f"{f' (said: {why})' if why else ''}"
-    )
-
-
-def _largest(seen: Seen) -> float | None:
-    return max((node.error for node in seen.nodes if node.error is not None), default=None)
-
-
-def _milliseconds(*seconds: float | None) -> str:
-    return ", ".join(f"{1e3 * one:.1f}" for one in seconds if one is not None)
+    missed = f"substituted {seen.pairs_substituted} pairs, {seen.measurements_substituted} measurements"
+    return f"{missed}; events name {why}" if why else missed
 
 
 def _word(value: object) -> str:
