@@ -76,7 +76,9 @@ def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
             heard = session.overhear()
             session.watch()
             wait_for_coordinator(words, name, network.wait)
-            yield Onlooker(session, words, heard, name)
+            onlooker = Onlooker(session, words, heard, name)
+            onlooker.heed()
+            yield onlooker
 
 
 def find_run(network: Network) -> str:
@@ -90,7 +92,7 @@ def find_run(network: Network) -> str:
             where = ", ".join(network.connect)
             raise RunBroken(f"no run was found at {where} within {network.wait:g} s") from None
         deadline = time.monotonic() + AMONG_SECONDS
-        while (left := deadline - time.monotonic()) > 0.0:
+        while len(names) == 1 and (left := deadline - time.monotonic()) > 0.0:
             try:
                 names.add(found.get(timeout=left))
             except Empty:

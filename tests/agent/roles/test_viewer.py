@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from here import here
 from places import GOLDEN
+from roles import Roles
 from runs import end_of, freeze, line_with, numbers_of, peakmesh, started, thaw
 from websockets import Subprotocol
 from websockets.sync.client import ClientConnection, connect
@@ -64,28 +65,10 @@ def client_of(url: str) -> Iterator[Client]:
         yield Client(websocket)
 
 
-class Roles:
-    """A coordinator that waits, at `address`; `start` starts everybody else, all of them until the end of the test."""
-
-    def __init__(self, stack: ExitStack, recording: Path, steps: int) -> None:
-        self._stack, self.recording = stack, recording
-        words = ["coordinator", GAINS, "--steps", steps, "--listen", "tcp/127.0.0.1:0"]
-        self.coordinator = stack.enter_context(started(*words))
-        self.address = line_with(self.coordinator, "listening at").split()[-1]
-
-    def start(self) -> None:
-        self.nodes = [self._role("node", GAINS, "--node", name) for name in NAMES]
-        self._role("plant", GAINS)
-        self.recorder = self._role("recorder", GAINS, "-o", self.recording)
-
-    def _role(self, *words: object) -> Popen[str]:
-        return self._stack.enter_context(started(*words, "--connect", self.address))
-
-
 @pytest.fixture
 def roles(tmp_path: Path) -> Iterator[Callable[[int], Roles]]:
     with ExitStack() as stack:
-        yield lambda steps: Roles(stack, tmp_path / "run.mcap", steps)
+        yield lambda steps: Roles(stack, GAINS, tmp_path / "run.mcap", "--steps", steps)
 
 
 def test_a_client_gets_every_message_of_a_run(roles: Callable[[int], Roles]) -> None:

@@ -1,0 +1,142 @@
+"""`peakmesh watch` comes to a real run when it likes, shows what is recorded, and leaves as it likes."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import Popen
+from typing import Any
+
+import numpy as np
+import pytest
+from here import here
+from places import GOLDEN
+from roles import Roles
+from runs import MANY, answer, decoded, end_of, line_with, logged, peakmesh, program, started
+
+from agent.contract.gains import Gains
+from agent.contract.messages import Estimate, PlantState
+from designer.replay import replay
+
+GAINS = GOLDEN / "zhu2020-lossy.gains.json"
+NAMES = Gains.load(GAINS).problem.node_names
+
+State = dict[str, Any]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Roles]:
+    """A paced run that goes on until the test ends it."""
+    with ExitStack() as stack:
+        plan = "--steps", MANY, "--period", "100ms"
+        roles = Roles(stack, GAINS, tmp_path / "run.mcap", *plan, run="shown")
+        roles.start()
+        line_with(roles.coordinator, "the run starts")
+        yield roles
+
+
+def until(process: Popen[str], holds: Callable[[State], bool]) -> Iterator[State]:
+    """The states that are printed, up to the first of which it holds."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        state = json.loads(line)
+        yield state
+        if holds(state):
+            return
+    raise AssertionError("it ended before")
+
+
+def is_complete(state: State) -> bool:
+    return state["ledger"] is not None and all(node["step"] is not None for node in state["nodes"])
+
+
+def node(state: State, name: str) -> State:
+    (found,) = (node for node in state["nodes"] if node["name"] == name)
+    return dict(found)
+
+
+def test_it_watches_a_run_from_the_middle_and_leaves_without_harm(run: Roles, tmp_path: Path) -> None:
+    words = "watch", "--connect", run.address
+    with started(*words, "--json") as watch, started(*words) as log:
+        states = list(until(watch, is_complete))
+        run.nodes[1].kill()
+        states += until(watch, lambda state: "node-2" in state["gone"])
+        last = node(states[-1], "2")["step"]
+        run.node("2")
+        states += until(watch, lambda state: node(state, "2")["there"] and node(state, "2")["step"] > last)
+        once = answer(peakmesh("watch", GAINS, "--connect", run.address, "--once", "--json"))
+        assert (once["run"], once["ended"]) == ("shown", None)
+        other = tmp_path / "other.json"
+        document = Gains.load(GAINS).document()
+        document["solver"]["seconds"] += 1.0
+        Gains.from_document(document).save(other)
+        refused = peakmesh("watch", other, "--connect", run.address)
+        assert refused.returncode == 2
+        assert 'run "shown" has other gains' in refused.stderr
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(60) == 130
+        watched_to_its_end(run, log)
+    assert replay(run.recording).agrees
+    what_was_shown_is_what_was_recorded(run.recording, [*states, once])
+
+
+def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
+    """The run is stopped, and whoever still watches it says so and leaves; nothing of it is missing."""
+    close_a_terminal_on(run)
+    assert run.coordinator.poll() is None
+    run.coordinator.send_signal(signal.SIGINT)
+    assert run.coordinator.wait(60) == 130
+    said, complaints = log.communicate(timeout=60)
+    assert (log.returncode, complaints) == (0, "")
+    assert all(line.startswith(("step ", "  step ")) for line in said.splitlines())
+    assert "0 of 4 nodes" in said.splitlines()[-1]
+    run.recorder.wait(60)
+    end = end_of(run.recording)
+    assert end is not None
+    assert {value for name, value in end.items() if name.startswith("missing.")} == {"0"}
+
+
+def close_a_terminal_on(run: Roles) -> None:
+    """A watch in a terminal of its own that is closed once it shows the nodes: it ends."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ |= {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
+        os.execv(program()[0], program("watch", "--connect", run.address))
+    shown = b""
+    while b"innovation" not in shown:
+        shown += os.read(terminal, 4096)
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert status  # it was told, or killed
+
+
+def what_was_shown_is_what_was_recorded(recording: Path, states: list[State]) -> None:
+    """Innovations, who was heard, and errors, number by number; what node 2 sent last may have gone here alone."""
+    messages = [(message.topic, decoded(message)) for message in logged(recording)]
+    z = {said.step: said.z for _, said in messages if isinstance(said, PlantState)}
+    made = {(topic.split("/")[1], said.step): said for topic, said in messages if isinstance(said, Estimate)}
+    compared = 0
+    for state in states:
+        for seen in state["nodes"]:
+            said = made.get((seen["name"], seen["step"]))
+            if said is None:
+                assert seen["step"] is None or seen["name"] == "2"
+                continue
+            assert (seen["heard"], seen["measured"]) == (said.heard, said.measured)
+            assert seen["innovation"] == pytest.approx(float(np.linalg.norm(said.innovation)), rel=1e-12)
+            if (k := seen["error_step"]) is not None:
+                error = float(np.linalg.norm(np.subtract(z[k], made[seen["name"], k].z_hat)))
+                assert seen["error"] == pytest.approx(error, rel=1e-12)
+                compared += 1
+    assert compared >= len(NAMES)
+
+
+@pytest.mark.parametrize("words", [["--run", "a/b"], ["--connect", "7447"], []])
+def test_bad_usage_is_refused(words: list[str]) -> None:
+    done = here("watch", *(words if "--connect" in words or not words else [*words, "--connect", "tcp/127.0.0.1:1"]))
+    assert (done.returncode, done.stdout) == (2, "")
