@@ -120,6 +120,9 @@ def examples() -> dict[type, Frozen]:
         messages.BrokenOff(reason="the disk is full", steps=3, stop=True),
         messages.Ready(who="node-1", session="a", gains="b"),
         messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
+        messages.Facts(
+            start=messages.Control(order="start", steps=1, seed=0, window=1, external=["1"], reason=""), gains="{}"
+        ),
         messages.Acknowledged(
             steps=1, messages=2, missing=0, received={"plant": 1}, reached={}, lacking=[], closed=False
         ),

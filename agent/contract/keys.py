@@ -23,7 +23,7 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
-| facts                  | queryable   | recorder: Facts            | viewers: what run this is                  |
+| facts                  | Facts       | recorder, when asked       | viewers: what run this is                  |
 | watch/<data topic>     | the same    | publishers, to viewers     | viewers, where there are any, without stamp|
 
 The recorder writes one more topic to the file, which is never on the wire:

@@ -18,6 +18,7 @@ from agent.contract.keys import (
     COORDINATOR,
     EVENT,
     EVIDENCE,
+    FACTS,
     MODE,
     PLANT,
     PLANT_STATE,
@@ -33,6 +34,7 @@ from agent.contract.keys import (
     ready,
     refused,
     replay,
+    run_of,
     sender_of,
     sensor_who,
     session,
@@ -51,6 +53,7 @@ def test_a_topic_is_the_inverse_of_its_key(run: str, node: str) -> None:
         for shown in (topic, watch(topic)):
             assert topic_of(key(run, shown, who=node_who(node))) == topic_of(key(run, shown)) == shown
         assert key(run, topic).split("/")[:2] == ["peakmesh", run]
+        assert run_of(key(run, topic)) == run
 
 
 @given(NAMES, NAMES)
@@ -108,6 +111,7 @@ def test_the_table_names_every_key_of_the_code() -> None:
         CONTROL: "Control",
         ACKNOWLEDGED: "Acknowledged",
         replay("<who>"): "queryable",
+        FACTS: "Facts",
         watch("<data topic>"): "the same",
     }
     assert table == topics | others

@@ -17,7 +17,6 @@ from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.exact import step as backwards
 from designer.ledger.account import account, deviations
-from designer.ledger.cheap import Cheap
 from designer.ledger.deviation import AS_DESIGNED, Deviation, Models, Unabsorbed
 from designer.ledger.exact import Ledger
 from designer.ledger.promise import SHARE
@@ -273,40 +272,6 @@ def test_faults_without_end_are_kept_in_bounds() -> None:
     for _ in range(100):
         book.step()
     assert book.gain() == GAIN.high
-
-
-def test_the_cheap_account_is_above_the_moments() -> None:
-    """Of a fixed w, by second moments of [eta; 1], through faults, a beginning and a jump."""
-    assert GAIN.P is not None
-    cheap, models = Cheap(PROBLEM, K_BAR, H_BAR, P=GAIN.P), Models(PROBLEM, K_BAR, H_BAR)
-    rng, size = np.random.default_rng(2), 2 + 8
-    schedule = [AS_DESIGNED] * 5 + [silent(0)] * 4 + [away(2)] * 3 + [Deviation(begun=frozenset({(2, None)}))]
-    X, mean = np.zeros((4, size, size)), np.zeros((4, size))
-    chances = np.eye(4)[0]
-    for k, fault in enumerate(schedule + [AS_DESIGNED] * 15):
-        acting = models.acting(fault)
-        if k == 18:
-            delta = rng.normal(size=size)
-            cheap.jump(max(delta @ P_s @ delta for P_s in GAIN.P))
-            cross = mean[:, :, None] * delta
-            X = X + cross + cross.swapaxes(1, 2) + chances[:, None, None] * np.outer(delta, delta)
-            mean = mean + chances[:, None] * delta
-        cheap.tell(fault)
-        X = acting.after(X)
-        mean = mean if acting.J is None else mean @ acting.J.T
-        moment = float(np.einsum("sij,sij->", acting.MM, X))
-        assert moment <= cheap.bound() ** 2 * (1.0 + 1e-9)
-        w = rng.normal(size=PROBLEM.nw)
-        joint = np.zeros((4, size + PROBLEM.nw, size + PROBLEM.nw))
-        joint[:, :size, :size], joint[:, :size, size:] = X, mean[:, :, None] * w
-        joint[:, size:, :size] = joint[:, :size, size:].swapaxes(1, 2)
-        joint[:, size:, size:] = chances[:, None, None] * np.outer(w, w)
-        both = np.hstack([mean, chances[:, None] * w])
-        AB = np.concatenate([acting.operator.model.A, acting.operator.model.B], axis=2)
-        mean = PROBLEM.markov.transition.T @ np.einsum("sij,sj->si", AB, both)
-        X, chances = acting.operator.carry(joint), chances @ PROBLEM.markov.transition
-        cheap.step(float(w @ w))
-    assert all(cheap.rates(AS_DESIGNED)[2:])
 
 
 def test_a_certificate_without_a_stored_P_has_a_ledger_too() -> None:
