@@ -17,7 +17,7 @@ from typing import NoReturn
 from pydantic import ValidationError
 
 from agent.contract.errors import InputError, Interrupted, RunBroken, listed
-from agent.contract.keys import COORDINATOR, FACTS
+from agent.contract.keys import COORDINATOR, FACTS, VIEWER
 from agent.contract.messages import Facts
 from agent.network.arrivals import Arrival, Arrivals
 from agent.network.configuration import Network
@@ -72,7 +72,7 @@ def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
     with stopped_by_signals():
         name = find_run(network) if run is None else run
         words = Words("")
-        with closing(Session(network, run=name, hand_over=words.put)) as session:
+        with closing(Session(network, run=name, who=VIEWER, hand_over=words.put)) as session:
             heard = session.overhear()
             session.watch()
             wait_for_coordinator(words, name, network.wait)
@@ -84,7 +84,7 @@ def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
 def find_run(network: Network) -> str:
     """The name of the only run on this network."""
     found: SimpleQueue[str] = SimpleQueue()
-    with closing(Session(network, run="", hand_over=lambda duty: None)) as session:
+    with closing(Session(network, run="", who=VIEWER, hand_over=lambda duty: None)) as session:
         session.watch_runs(found.put)
         try:
             names = {found.get(timeout=network.wait)}

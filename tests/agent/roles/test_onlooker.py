@@ -27,7 +27,7 @@ def runs() -> Iterator[Callable[..., Network]]:
             address = ()
             for run, who in places:
                 network = Network(connect=address)
-                session = stack.enter_context(closing(Session(network, run=run, hand_over=lambda duty: None)))
+                session = stack.enter_context(closing(Session(network, run=run, who=who, hand_over=lambda duty: None)))
                 session.appear(who)
                 address = address or tuple(session.locators())
             return Network(connect=address, wait=PATIENCE)
