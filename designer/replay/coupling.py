@@ -227,7 +227,7 @@ def _unsaid(log: Log) -> Flags:
     for i in range(log.gains.problem.n):
         if not log.said.events:
             unsaid[:, i] = True
-        elif log.said.accounts.get(i, -1) < log.planned - 1:
+        elif log.said.accounted(i) < log.planned - 1:
             unsaid[max(0, log.steps - log.said.memory) :, i] = True
     return unsaid
 

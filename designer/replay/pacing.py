@@ -4,16 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agent.contract.errors import counted
+from agent.contract.messages import Account
 from designer.replay.coupling import Coupling
 from designer.replay.log import Log
 from designer.replay.topics import Numbers
 
 NAMED = 5
+
+
+class Delays(NamedTuple):
+    """What a node has told of its latencies, in s: median, 99th percentile and maximum of each."""
+
+    node: str
+    to_estimate: tuple[float, float, float]  # from the arrival of its measurement to the estimate with it
+    to_step: tuple[float, float, float]  # from a tick to the next estimate
+
+    @classmethod
+    def of(cls, node: str, account: Account) -> Delays:
+        return cls(
+            node,
+            (account.to_estimate_median, account.to_estimate_p99, account.to_estimate_max),
+            (account.to_step_median, account.to_step_p99, account.to_step_max),
+        )
 
 
 @dataclass(frozen=True)
@@ -31,6 +48,7 @@ class Pacing:
     beginnings: tuple[str, ...]  # who began again, when, and with what
     absences: tuple[str, ...]
     faults: tuple[str, ...]  # injected
+    delays: tuple[Delays, ...]  # of the nodes that have given account, by the last process of each
 
     @classmethod
     def of(cls, coupling: Coupling, by_seed: Numbers, period: float) -> Pacing:
@@ -57,11 +75,13 @@ class Pacing:
             beginnings=tuple(_beginnings(log)),
             absences=tuple(_absences(coupling)),
             faults=tuple(log.said.faults),
+            delays=tuple(Delays.of(names[i], account) for i, account in sorted(log.said.accounts.items())),
         )
 
     def document(self) -> dict[str, Any]:
         """For --json."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+        return plain | {"delays": [delays._asdict() for delays in self.delays]}
 
     def text(self) -> list[str]:
         share = f" ({self.pairs_substituted / self.pairs:.2%})" if self.pairs else ""
@@ -71,6 +91,13 @@ class Pacing:
             f"{share}, {counted(self.measurements_substituted, 'measurement')}; "
             f"{why or 'nothing was late'}; {self.pairs_lost} lost by the model"
         ]
+        for words, of in (("measurement to estimate", "to_estimate"), ("tick to step", "to_step")):
+            if self.delays:
+                each = zip(*(getattr(one, of) for one in self.delays), strict=True)
+                median, p99, most = (1e3 * max(times) for times in each)
+                lines.append(
+                    f"{words}: median {median:.2f} ms, 99 % {p99:.2f} ms, most {most:.2f} ms, of the worst node"
+                )
         if self.unexplained_total:
             lines.append(f"unexplained: {self.unexplained_total} ({'; '.join(self.unexplained)})")
         for word, some in (("fault", self.faults), ("away", self.absences), ("began again", self.beginnings)):

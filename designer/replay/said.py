@@ -20,7 +20,7 @@ class Said:
 
     def __init__(self, node_names: tuple[str, ...], *, memory: int = 0) -> None:
         self.events = 0
-        self.accounts: dict[int, int] = {}  # of a node, the last step that it has given account of
+        self.accounts: dict[int, Account] = {}  # of a node, the last that it has given of itself
         self.memory = memory  # steps of which a process that is killed may not have given its reasons yet
         self.pairs: set[tuple[int, int, int]] = set()  # (step, receiver, sender): it was substituted
         self.measurements: set[tuple[int, int]] = set()  # (step, node)
@@ -37,8 +37,12 @@ class Said:
 
     def account(self, account: Account) -> None:
         i = self._nodes.get(account.who)
-        if i is not None:
-            self.accounts[i] = max(account.step, self.accounts.get(i, -1))
+        if i is not None and account.step >= self.accounted(i):
+            self.accounts[i] = account
+
+    def accounted(self, i: int) -> int:
+        """The last step that a node has given account of; -1 where it has of none."""
+        return self.accounts[i].step if i in self.accounts else -1
 
     def add(self, event: Event) -> None:
         self.events += 1

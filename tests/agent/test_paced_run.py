@@ -46,6 +46,7 @@ def survived(gains_path: Path, recording: Path, *faults: str) -> tuple[dict[str,
     assert verdict.steps == STEPS
     assert verdict.pacing is not None
     assert verdict.pacing.faults == faults
+    assert answer(ran)["ledger"] == (verdict.ledger.document() if verdict.ledger else None)
     return answer(ran), verdict
 
 

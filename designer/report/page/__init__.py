@@ -10,6 +10,7 @@ import numpy as np
 from designer.report.account import Account
 from designer.report.chart import LOOKS
 from designer.report.graphs import NAMED
+from designer.report.page.clock import clock
 from designer.report.page.drawing import draw
 from designer.report.page.sections import head, ladder, nodes, proofs, provenance
 from designer.report.page.topology import topology_html
@@ -39,7 +40,8 @@ def page(account: Account) -> str:
             '<meta name="color-scheme" content="light dark">',
             f"<title>{title}</title><style>{_style()}</style></head><body>",
             '<a class="skip" href="#figures">To the pictures</a>',
-            f"<header>{head(account)}</header><main>{proofs(account)}{figures}{ladder(account)}{nodes(account)}</main>",
+            f"<header>{head(account)}</header><main>{proofs(account)}{clock(account)}{figures}"
+            f"{ladder(account)}{nodes(account)}</main>",
             f'<footer>{provenance(account)}</footer><p id="said" aria-live="polite"></p>',
             f'<script type="application/json" id="data">{{"start":{start},"charts":{{{data}}}}}</script>',
             f"<script>{_asset('page.js')}</script></body></html>",

@@ -145,6 +145,8 @@ def provenance(account: Account) -> str:
     """What it takes to check all of this, or to run it again."""
     log, run = account.log, account.log.run
     again = f"peakmesh run gains.json --steps {log.planned} --seed {log.seed}"
+    if log.is_paced:
+        again = "not possible: the clock decided what came in time"
     facts = [
         *((f"recording {path.name}", f"SHA-256 {_sha256(path)}") for path in account.paths if path.is_file()),
         ("run", run.get("run", "")),

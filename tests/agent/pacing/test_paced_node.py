@@ -203,3 +203,14 @@ def test_the_account_counts_what_happened() -> None:
     assert sum(account["late"] for account in accounts) == sum(n for (*_, kind), n in said.items() if kind == "late")
     assert all(0.0 <= account["to_estimate_median"] <= account["to_estimate_max"] <= 0.04 for account in accounts)
     assert all(0.0 < account["to_step_median"] <= account["to_step_p99"] <= 0.08 * 1.02 for account in accounts)
+
+
+def test_an_account_is_given_now_and_then_and_at_the_end() -> None:
+    """Each of all steps so far: so who comes late knows it too."""
+    run = PacedRun(GAINS, steps=100)
+    for name in run.nodes:
+        accounts = [
+            sent.document for sent in run.messages if sent.topic == "account" and sent.document["who"] == f"node-{name}"
+        ]
+        assert [account["step"] for account in accounts] == [29, 59, 89, 99]
+        assert [account["steps"] for account in accounts] == [30, 60, 90, 100]

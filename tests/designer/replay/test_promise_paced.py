@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from made_recordings import record
 from paced_runs import PACE, SOON, PacedRun
 from places import ROOT
@@ -14,7 +15,7 @@ from places import ROOT
 from agent.contract.gains import Gains
 from designer.ledger.deviation import Deviation
 from designer.ledger.exact import Ledger
-from designer.replay import proofs, replay
+from designer.replay import ledger, proofs, replay
 from designer.replay.central import Central
 from designer.replay.coupling import Coupling
 from designer.replay.inputs import draw, logged_inputs
@@ -61,6 +62,14 @@ def test_a_node_that_was_away_is_absent_and_begins_again(tmp_path: Path) -> None
     assert verdict.ledger.worst.factor >= book.gain() / book.gamma > 1.2
     assert verdict.ledger.last.status == "valid"
     assert "steps with faults" in verdict.text()
+
+
+@pytest.mark.parametrize("faults", [{}, {"away": {"1": range(30, 36)}}, {"frozen": {"2": range(20, 26)}}])
+def test_the_ledger_alone_says_what_the_whole_replay_says(tmp_path: Path, faults: dict[str, Any]) -> None:
+    path = run(tmp_path, **faults)
+    account = ledger([path])
+    assert account == replay(path).ledger
+    assert account.is_plain == (not faults)
 
 
 def test_a_message_that_is_lost_on_the_way_is_told_and_a_measurement_too(tmp_path: Path) -> None:

@@ -347,3 +347,16 @@ def test_a_lock_step_run_may_not_say_what_paced_runs_say(tmp_path: Path) -> None
 
 def test_a_paced_run_that_is_passed_off_as_lock_step_is_found(tmp_path: Path) -> None:
     assert verdict_of(tmp_path, TRUE, period="0").exit_code == 1
+
+
+def test_the_delays_are_those_of_the_last_account_of_each_node(tmp_path: Path) -> None:
+    """What a killed node told before is of another process."""
+    told = {sent.document["who"]: sent.document for sent in TRUE if sent.topic == "account"}
+    pacing = verdict_of(tmp_path, TRUE).pacing
+    assert pacing is not None
+    assert [f"node-{delays.node}" for delays in pacing.delays] == sorted(told)
+    for delays in pacing.delays:
+        account = told[f"node-{delays.node}"]
+        assert delays.to_estimate == tuple(account[f"to_estimate_{what}"] for what in ("median", "p99", "max"))
+        assert delays.to_step == tuple(account[f"to_step_{what}"] for what in ("median", "p99", "max"))
+    assert f"{1e3 * max(one.to_step[2] for one in pacing.delays):.2f} ms" in "".join(pacing.text())

@@ -217,7 +217,14 @@ def test_gamma_is_not_promised_of_a_run_with_faults(tmp_path: Path, golden: Acco
     assert "that is proved" not in error_sentence(account)
     assert account.verdict.ledger is not None
     assert f"of this one it says: {account.verdict.ledger.text()}" in error_sentence(account)
-    assert "something happened that it does not cover" in Checked(page(account)).text
+    shown = Checked(page(account)).text
+    assert "something happened that it does not cover" in shown
+    assert account.verdict.pacing is not None
+    for delays in account.verdict.pacing.delays:
+        cells = "".join(f"{1e3 * seconds:.2f}" for seconds in (*delays.to_estimate, *delays.to_step))
+        assert f"{delays.node}{cells}" in shown
+    assert all(" ".join(line.split()) in shown for line in account.verdict.pacing.text())
+    assert "Against the clock" not in Checked(page(golden)).text
 
 
 def test_what_a_filter_left_out_is_named_and_accuses_nobody(tmp_path: Path) -> None:
