@@ -7,7 +7,6 @@ multiplies K_ij and H_ij by a_ij. The problem that they are analysed on is the o
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from pydantic import ValidationError
 
 from agent.contract.arrays import Array, Model
 from agent.contract.errors import InputError, first_fault
-from agent.contract.files import read_bytes
+from agent.contract.files import read_bytes, read_json
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
 from designer.diagnosis import refuse_nothing_to_estimate
@@ -140,7 +139,7 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     """Read gains for the links of `problem`. Raises InputError: one sentence for what does not fit."""
     data = read_bytes(path, kind="gains file")
     try:
-        document = json.loads(data)
+        document = read_json(data)
     except (ValueError, RecursionError):
         document = None
     file = None

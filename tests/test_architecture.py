@@ -51,14 +51,14 @@ ROOMS = {
     "designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
-    "designer.simulation": "designer.model designer.workers",
+    "designer.simulation": "designer.gain designer.model designer.workers",
     "designer.ledger": "designer.gain designer.model designer.proof",
     "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
     "designer.identify": "designer.gain designer.model designer.replay",
     "designer.report": "designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
-    "designer.show": "agent.contract.recording",
+    "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
     "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
