@@ -259,7 +259,7 @@ def _added_up(network: Network, sizes: Array) -> Array:
 
 def _roundings(network: Network) -> int:
     """That a term meets at most: in nu, in the sum for e, in what lost messages add, and in the numbers themselves."""
-    return 2 * network.to_e.shape[2] + 3 * max(map(len, network.lossy)) + 10
+    return 2 * int(network.to_e.shape[2]) + 3 * max(map(len, network.lossy)) + 10
 
 
 def _disturbance(gains: Gains, steps: int) -> Array | float:

@@ -36,9 +36,10 @@ ROOMS = {
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     # the mathematics
+    "designer.decay": "",
     "designer.model": "",
-    "designer.gain": "designer.model",
-    "designer.proof": "",
+    "designer.gain": "designer.decay designer.model",
+    "designer.proof": "designer.decay",
     "designer.lmi": "designer.gain designer.model designer.proof",
     "designer.search": "designer.gain designer.lmi designer.model designer.proof",
     "designer.problems": "",
@@ -46,7 +47,8 @@ ROOMS = {
     "designer.ladder": "designer.lmi",
     "designer.workers": "",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
-    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.search",
+    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
+    "designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
@@ -77,6 +79,7 @@ DOORS = {
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
     "scipy": [
+        "designer/decay.py",
         "designer/lmi/",
         "designer/gain/products.py",
         "designer/proof/float_model.py",

@@ -56,12 +56,14 @@ def verify_command(options: argparse.Namespace) -> int:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
     if options.json:
         said = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
-        print(json.dumps(verdict._asdict() | said | _of_problem(gains)))
+        print(json.dumps(verdict._asdict() | said | _of_problem(gains) | {"claimed": _claimed(gains, verdict.low)}))
         return EXIT_GOOD if verdict.holds else EXIT_NO
     lines = [f"of      {text}" for text in _whose(gains, differs)]
     if verdict.holds:
+        if verdict.low is not None:
+            proved.append(f"the exact gain is between {verdict.low} and {verdict.gamma}: below, some w does worse")
         lines = [f"holds: gamma = {verdict.gamma} is proved", *lines, *(f"proved  {text}" for text in proved)]
-        lines += [f"claimed {text}" for text in _claimed(gains)]
+        lines += [f"claimed {text}" for text in _claimed(gains, verdict.low)]
     else:
         no = f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
         lines = [no, *lines]
@@ -95,7 +97,6 @@ def _of_problem(gains: Gains) -> dict[str, object]:
         "problem": gains.problem.name,
         "problem_digest": gains.problem_digest,
         "is_another": is_another(gains.problem),
-        "claimed": _claimed(gains),
     }
 
 
@@ -115,9 +116,9 @@ def _whose(gains: Gains, differs: list[str]) -> list[str]:
     return lines
 
 
-def _claimed(gains: Gains) -> list[str]:
+def _claimed(gains: Gains, low: float | None) -> list[str]:
     """What stands in the file too, and is not proved here."""
-    beside = ("exact", "floor", "lmi_gamma", "lmi_exact")
+    beside = ("floor", "lmi_gamma", "lmi_exact", *(("exact",) if low is None else ()))
     there = [name for name in beside if getattr(gains.certificate, name) is not None]
     found = [f"{listed(there)}: computed by whoever designed the gains"] if there else []
     if gains.worst_case is not None:

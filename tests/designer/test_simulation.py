@@ -302,7 +302,9 @@ def ensemble_of(sizes: Array, *, gamma: float = 1.0) -> Ensemble:
         part = rows.T
         largest, others = simulation._set_apart(part, ignored)
         squares = ((part - part.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
-        tally = simulation.Tally(part.shape[1], part.mean(axis=1), squares, largest, others, part.mean(axis=1), np.sqrt(part.max(axis=0)))
+        tally = simulation.Tally(
+            part.shape[1], part.mean(axis=1), squares, largest, others, part.mean(axis=1), np.sqrt(part.max(axis=0))
+        )
         found = tally if found is None else simulation._together(found, tally, ignored)
     assert found is not None
     return simulation._ensemble(gamma, found, np.ones(steps))
@@ -340,7 +342,7 @@ def test_what_is_clearly_too_much_is_refuted() -> None:
 
 
 def exactly_measured() -> Gains:
-    """Two nodes that measure w itself: what is left of their errors is the rounding of the gains, 2e-17 of w or less."""
+    """Two nodes that measure w itself: their errors are the rounding of the gains, 2e-17 of w or less."""
     rng = np.random.default_rng(23)
     A, B = np.array([[0.19, 0.075], [-0.02, -0.8]]), rng.normal(size=(2, 2))
     sensor = {"C": np.zeros((2, 2)).tolist(), "D": np.eye(2).tolist(), "arrival_probability": 1.0}
@@ -544,7 +546,7 @@ def test_a_gamma_that_is_too_low_is_refuted_with_exit_code_1(
 
 
 def test_what_is_beyond_float64_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)))
+    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.full((2, 2, 2), 0.5))
     gains = uncertified(sticky(disturbance={"kind": "impulse"}), K, H, method="none")
     assert simulate_command(tmp_path, "--steps", 400, "--runs", 20, "--json", gains=gains) == 1
     facts = json.loads(capsys.readouterr().out)

@@ -197,10 +197,10 @@ def unfit(run: Run, surveys: Sequence[Survey], used: Gains | None) -> Iterator[t
 
     Where the run names none, and where it names others, the gains that are `used` and their problem count.
     """
-    digests = {} if used is None else {"gains": used.digest(), "problem_digest": used.problem_digest}
+    ours = {} if used is None else {"gains": used.digest(), "problem_digest": used.problem_digest}
     for name, key, model in _DIGESTS:
         named = run.facts.get(key, "")
-        wanted = digests.get(key, named)
+        wanted = ours.get(key, named)
         if named not in ("", wanted):
             yield f"the run names {name} of digest {named[:12]}..., and was held against {wanted[:12]}...", True
         there = list(_named(name, surveys))
