@@ -7,7 +7,6 @@ multiplies K_ij and H_ij by a_ij. The problem that they are analysed on is the o
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,16 +16,17 @@ from pydantic import ValidationError
 
 from agent.contract.arrays import Array, Model
 from agent.contract.errors import InputError, first_fault
-from agent.contract.files import read_bytes
+from agent.contract.files import read_bytes, read_json
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
 from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
-from designer.ladder import Ladder
+from designer.ladder import Ladder, interval
 from designer.model.error_model import error_model, stacked_links
-from designer.search.exact_design import certify, confirmed
+from designer.proof.prover import Prover
+from designer.search.exact_design import certify, confirmed, lower_end
 
 
 class GivenGains(NamedTuple):
@@ -50,7 +50,7 @@ class Analysis(NamedTuple):
 
     problem: Problem
     given: GivenGains
-    stable: bool
+    stable: bool | None  # mean-square: proved, proved not to be, or not known
     radius: float  # what E|eta|^2 is multiplied by in each step, in the long run
     horizon: int
     ladder: Ladder
@@ -104,12 +104,12 @@ class Analysis(NamedTuple):
                 f"designed for another problem, {given.file.problem.name} ({given.file.problem_digest[:12]}...), "
                 f"than the one here ({problem.digest()[:12]}...)"
             )
-        if not self.stable:
-            growth = f"{self.radius:.6g}" if math.isfinite(self.radius) else "more than a float64 holds"
-            lines.append(
-                f"NOT mean-square stable: in the long run each step multiplies E|error|^2 by {growth}; "
-                "no gamma bounds the error"
-            )
+        if self.u is None:
+            growth = f"{self.radius:.9g}" if math.isfinite(self.radius) else "more than a float64 holds"
+            known = "NOT mean-square stable, proved: from some start the errors never die out"
+            if self.stable is None:
+                known = "it is not known whether the errors are mean-square stable"
+            lines.append(f"{known}; computed: in the long run each step multiplies E|error|^2 by {growth}")
             if self.ladder.floor is None:
                 lines.append("no other gains do better: the sensors do not show an unstable part of the plant")
             return "\n".join(lines)
@@ -117,6 +117,7 @@ class Analysis(NamedTuple):
         assert self.u is not None
         assert self.w is not None
         low, high = self.ladder.exact
+        how = "proved" if self.unproved is None else "as far as floats tell"
         rungs = "\n           ".join(self.ladder.lines())
         then = f", then w = Gamma [x; e] for {_steps(self.steps - 1)}" if self.steps > 1 else ""
         if given.file is not None and given.file.certificate.holds and not self.foreign:
@@ -124,8 +125,9 @@ class Analysis(NamedTuple):
         if self.unproved is not None:
             lines.append(f"certified  no gamma: {self.unproved}")
         lines += [
-            f"stable     mean-square; each step multiplies E|error|^2 by {self.radius:.6g} in the long run",
-            f"exact gain between {low:.8g} and {high:.8g}: {_steps(self.horizon)} show that it is no less",
+            f"stable     mean-square, {'proved' if self.stable else 'as far as floats tell'}; computed: each step "
+            f"multiplies E|error|^2 by {self.radius:.6g} in the long run",
+            f"exact gain between {interval(low, high)}, {how}: {_steps(self.horizon)} show that it is no less",
             f"ladder     {rungs}",
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
             f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
@@ -140,7 +142,7 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     """Read gains for the links of `problem`. Raises InputError: one sentence for what does not fit."""
     data = read_bytes(path, kind="gains file")
     try:
-        document = json.loads(data)
+        document = read_json(data)
     except (ValueError, RecursionError):
         document = None
     file = None
@@ -174,14 +176,17 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
     least = floor(problem)
     ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)
     if not gain.stable:
-        return Analysis(problem, given, False, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
+        stable = Prover(problem, given.K, given.H).stable.holds
+        return Analysis(problem, given, stable, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
     verdict = confirmed(problem, given.K, given.H, gain.high)
+    if verdict.holds:
+        ladder = ladder._replace(exact=(lower_end(problem, given.K, given.H, gain), verdict.gamma))
     policy = worst_policy(model, horizon=gain.horizon)
     fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
         problem=problem,
         given=given,
-        stable=True,
+        stable=verdict.holds or Prover(problem, given.K, given.H).stable.holds,
         radius=gain.radius,
         horizon=gain.horizon,
         ladder=ladder._replace(gamma=verdict.gamma if verdict.holds else None),

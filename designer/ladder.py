@@ -7,7 +7,7 @@ have: that is how loose the bound is. What lies below both is what better gains 
 from __future__ import annotations
 
 import math
-from decimal import ROUND_CEILING, Decimal, localcontext
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal, localcontext
 from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
@@ -89,8 +89,17 @@ def ladder_of(gains: Gains) -> Ladder:
 
 def rounded_up(bound: float) -> str:
     """Six decimals, of a small number four digits; never below the bound, because less than what is proved is not."""
-    decimals = max(6, 3 - math.floor(math.log10(bound)))
-    with localcontext(prec=800, rounding=ROUND_CEILING):
+    return _rounded(bound, ROUND_CEILING, digits=4)
+
+
+def interval(low: float, high: float) -> str:
+    """ "low and high" of eight digits or more, rounded outwards."""
+    return f"{_rounded(low, ROUND_FLOOR, digits=8)} and {_rounded(high, ROUND_CEILING, digits=8)}"
+
+
+def _rounded(bound: float, rounding: str, *, digits: int) -> str:
+    decimals = max(6, digits - 1 - math.floor(math.log10(bound))) if bound > 0.0 else 6
+    with localcontext(prec=800, rounding=rounding):
         return f"{Decimal(str(bound)):.{decimals}f}"
 
 

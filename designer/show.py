@@ -14,6 +14,7 @@ from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
+from designer.problems import is_another
 
 MCAP_MAGIC = b"\x89MCAP"
 LARGEST = 1 << 28  # bytes of a problem or gains file
@@ -130,6 +131,8 @@ def _gains(gains: Gains) -> dict[str, Any]:
     return {
         "kind": "gains",
         "problem": gains.problem.name,
+        "problem_digest": gains.problem_digest,
+        "is_another": is_another(gains.problem),
         "size": _size(gains.problem),
         "method": gains.method,
         "gamma": proved.gamma,
@@ -149,6 +152,8 @@ def _gains(gains: Gains) -> dict[str, Any]:
 def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     """Anybody may have edited the file since it was verified: what it says of itself is no verdict."""
     shown = facts | {"gamma": "not claimed"}
+    if facts.get("is_another"):
+        shown["problem"] = f"{facts['problem']}, which is NOT the built-in problem of this name"
     if facts["holds"]:
         command = "verify" if facts["kind"] == "gains" else "replay"
         shown["gamma"] = f'claimed {facts["gamma"]}, by design; "peakmesh {command}" checks it'
@@ -161,7 +166,7 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
     if facts.get("floor") is not None:
         shown["floor"] = f"claimed {facts['floor']:.6g}"
     absent = {name for name in ("theorem1_gamma", "lmi_gamma", "exact", "floor") if facts.get(name) is None}
-    return {name: value for name, value in shown.items() if name not in {"holds", "verified", *absent}}
+    return {name: value for name, value in shown.items() if name not in {"holds", "verified", "is_another", *absent}}
 
 
 def _recording(reader: RecordingReader, report: Progress | None) -> dict[str, Any]:

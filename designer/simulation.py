@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import NormalDist
 from typing import NamedTuple
@@ -33,7 +33,8 @@ from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
-from designer.model.error_model import measurement_slices, stacked_gains
+from designer.gain.exact import Operator
+from designer.model.error_model import error_model, measurement_slices, stacked_gains
 from designer.workers import each
 
 CONFIDENCE = 0.99  # that the intervals of all steps hold at once
@@ -82,6 +83,7 @@ class State(NamedTuple):
     mode: Indices  # (runs,): r(k)
     x: Array  # (runs, nx); stays 0 where the errors do not depend on it
     e: Array  # (runs, n nx)
+    w: Array  # (runs, nw): w(k)
 
 
 class Tally(NamedTuple):
@@ -92,6 +94,7 @@ class Tally(NamedTuple):
     squares: Array  # (steps,): sum over the runs of the squared distances from the mean
     largest: Array  # (steps, some): the largest ones
     others: Array  # (steps,): sum of all the others
+    inputs: Array  # (steps, nx + n nx + nw): sum over the runs of the squares of x, e and w
     peaks: Array  # (runs,): max over k of |z_tilde(k)|
 
 
@@ -118,6 +121,7 @@ class Ensemble:
     high: Array
     least: Array
     energy: Array  # mean energy of w before the step, known exactly
+    rounding: Array  # sqrt E|z_tilde(k)|^2 that rounding may have made; 0 where nothing depends on it
     peaks: Array  # (runs,): max over k of |z_tilde(k)| of single runs
 
     @property
@@ -136,7 +140,7 @@ class Ensemble:
     @property
     def refuted_at(self) -> int | None:
         """The first step at which even `least` is above the bound, by more than rounding; None: there is none."""
-        above = self.least > self.bound * (1.0 + 1e-9)
+        above = self.least > (np.sqrt(self.bound * (1.0 + 1e-9)) + self.rounding) ** 2
         return int(np.argmax(above)) if above.any() else None
 
 
@@ -166,7 +170,10 @@ def simulate(
         if progress is not None:
             progress(found.runs)
     assert found is not None
-    return _ensemble(gains.certificate.gamma, found, _energy(network, steps))
+    ensemble = _ensemble(gains.certificate.gamma, found, _energy(network, steps))
+    if ensemble.refuted_at is None:
+        return ensemble
+    return replace(ensemble, rounding=_rounding(gains, network, found))
 
 
 def network_of(gains: Gains, *, steps: int, w: Array | None = None) -> Network:
@@ -215,6 +222,46 @@ def _lossy_messages(gains: Gains, K_bar: Array, H_bar: Array, rows: list[slice])
     return messages
 
 
+def _rounding(gains: Gains, network: Network, found: Tally) -> Array:
+    """What rounding may have made of sqrt E|z_tilde(k)|^2 at most, (steps,), from the sizes of what was added up.
+
+    Entry i of [x; e] is off by d_i(j) in step j, |d_i(j)| <= m u times the sum of the absolute values that it is made
+    of, m the number of roundings on the way of a term. What is left of d(j) in z_tilde(k) has no more than n_eta times
+    the sum of L^(k-1-j)(M'M)_ii E d_i(j)^2 for its mean square (Cauchy and Schwarz), since what is drawn after step j
+    does not depend on d(j); and roots of mean squares add up at most (Minkowski).
+    """
+    model = error_model(gains.problem, *stacked_gains(gains))
+    operator, steps = Operator(model), len(found.mean)
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = _added_up(network, np.sqrt(found.inputs / found.runs))[:, -model.size :] * _roundings(network) * 2.0**-53
+        Y, left = np.asarray(operator.MM), np.zeros(steps)
+        for m in range(steps - 1):
+            weights = model.size * Y.diagonal(axis1=1, axis2=2).max(axis=0)
+            left[m + 1 :] += np.sqrt(off[: steps - 1 - m] ** 2 @ weights)
+            Y = operator.corner(Y)
+    return np.where(np.isnan(left), np.inf, left)
+
+
+def _added_up(network: Network, sizes: Array) -> Array:
+    """The root mean square of the absolute values that add up to [x; e] in a step, (steps, nx + n nx), at most.
+
+    `sizes` (steps, nx + n nx + nw): the roots of the mean squares of x, e and w.
+    """
+    nx, n_e = len(network.A), network.Ce.shape[1]
+    x, e, w = sizes[:, :nx], sizes[:, nx : nx + n_e], sizes[:, nx + n_e :]
+    nu = x @ np.abs(network.C).T + e @ np.abs(network.Ce).T + w @ np.abs(network.D).T
+    of_e = np.hstack([x, e, nu, w]) @ np.abs(network.to_e).max(axis=0).T
+    for message in (message for of_mode in network.lossy for message in of_mode):
+        both = e[:, message.i] + e[:, message.j]
+        of_e[:, message.i] += both @ np.abs(message.K).T + nu[:, message.y_j] @ np.abs(message.H).T
+    return np.hstack([x @ np.abs(network.A).T + w @ np.abs(network.B).T, of_e])
+
+
+def _roundings(network: Network) -> int:
+    """That a term meets at most: in nu, in the sum for e, in what lost messages add, and in the numbers themselves."""
+    return 2 * int(network.to_e.shape[2]) + 3 * max(map(len, network.lossy)) + 10
+
+
 def _disturbance(gains: Gains, steps: int) -> Array | float:
     """What the problem says of w: all of it, or the deviation of white noise."""
     if isinstance(gains.problem.disturbance, White):
@@ -240,6 +287,7 @@ def tally_runs(network: Network, steps: int, ignored: int, seeds: Sequence[int])
     """|z_tilde(k)|^2 = sum over nodes of |M e_i(k)|^2 in the runs with these seeds; `ignored` of them are set apart."""
     runs, nx, ignored = len(seeds), len(network.A), min(ignored, len(seeds))
     mean, squares, others, peaks = np.empty(steps), np.empty(steps), np.empty(steps), np.zeros(runs)
+    inputs = np.empty((steps, nx + network.Ce.shape[1] + network.B.shape[1]))
     largest = np.empty((steps, ignored))
     with np.errstate(over="ignore", invalid="ignore"):  # errors may grow beyond float64, and count as infinite
         for k, state in enumerate(states(network, seeds, steps=steps)):
@@ -249,7 +297,8 @@ def tally_runs(network: Network, steps: int, ignored: int, seeds: Sequence[int])
             mean[k] = size.mean()
             squares[k] = ((size - mean[k]) ** 2).sum()
             largest[k], others[k] = _set_apart(size, ignored)
-    return Tally(runs, mean, squares, largest, others, np.sqrt(peaks))
+            inputs[k] = np.concatenate([(part**2).sum(axis=0) for part in state[1:]])
+    return Tally(runs, mean, squares, largest, others, inputs, np.sqrt(peaks))
 
 
 def _set_apart(sizes: Array, many: int) -> tuple[Array, Array]:
@@ -270,6 +319,7 @@ def _together(one: Tally, other: Tally, ignored: int) -> Tally:
             one.squares + other.squares + gap**2 * (one.runs * other.runs / runs),
             largest,
             one.others + other.others + others,
+            one.inputs + other.inputs,
             np.concatenate([one.peaks, other.peaks]),
         )
 
@@ -280,7 +330,7 @@ def states(network: Network, seeds: Sequence[int], *, steps: int) -> Iterator[St
     r = np.full(runs, network.initial)
     x, e = np.zeros((runs, len(network.A))), np.zeros((runs, network.Ce.shape[1]))
     for mode_draw, theta, delivered, w in _draws(network, seeds, steps):
-        yield State(r, x, e)
+        yield State(r, x, e, w)
         arrived = theta[:, owner].astype(np.float64)
         beta = network.beta[owner]
         nu = np.where(network.seen, arrived, beta) * (e @ network.Ce.T)
@@ -343,4 +393,4 @@ def _ensemble(gamma: float, found: Tally, energy: Array) -> Ensemble:
         mean = np.where(np.isnan(found.mean), np.inf, found.mean)
         low = np.where(np.isnan(half), 0.0, np.maximum(mean - half, 0.0))
         high = np.where(np.isnan(half), np.inf, mean + half)
-    return Ensemble(gamma, mean, low, high, found.others / runs, energy, found.peaks)
+    return Ensemble(gamma, mean, low, high, found.others / runs, energy, np.zeros(steps), found.peaks)

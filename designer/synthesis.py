@@ -17,7 +17,7 @@ from designer.model.error_model import error_model, stacked_gains
 from designer.proof.certificate import lyapunov_matrix
 from designer.search.descent import Budget, Progress
 from designer.search.effort import BUDGET, default_method
-from designer.search.exact_design import confirmed, design_exact
+from designer.search.exact_design import confirmed, design_exact, lower_end
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
@@ -62,12 +62,15 @@ def _with_exact(gains: Gains) -> Gains:
     if problem.n * problem.nx > _LADDER_STATES:
         return gains
     started = time.perf_counter()
-    exact = exact_gain(error_model(problem, *stacked_gains(gains))).bounds
+    gain = exact_gain(error_model(problem, *stacked_gains(gains)))
+    exact = gain.bounds
     found: dict[str, object] = {"exact": exact}
     if exact is not None and exact[1] < certificate.gamma:
         verdict = confirmed(problem, gains.K, gains.H, exact[1], P=lyapunov_matrix(gains))
         if verdict.holds and verdict.gamma < certificate.gamma:
+            low = lower_end(problem, gains.K, gains.H, gain)
             found |= {
+                "exact": (low, verdict.gamma),
                 "gamma": verdict.gamma,
                 "kind": "exact",
                 "theorem1_gamma": certificate.gamma,

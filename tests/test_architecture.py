@@ -36,9 +36,10 @@ ROOMS = {
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     # the mathematics
+    "designer.decay": "",
     "designer.model": "",
-    "designer.gain": "designer.model",
-    "designer.proof": "",
+    "designer.gain": "designer.decay designer.model",
+    "designer.proof": "designer.decay",
     "designer.lmi": "designer.gain designer.model designer.proof",
     "designer.search": "designer.gain designer.lmi designer.model designer.proof",
     "designer.problems": "",
@@ -46,12 +47,13 @@ ROOMS = {
     "designer.ladder": "designer.lmi",
     "designer.workers": "",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
-    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.search",
+    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
+    "designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
-    "designer.simulation": "designer.model designer.workers",
+    "designer.simulation": "designer.gain designer.model designer.workers",
     "designer.ledger": "designer.gain designer.model designer.proof",
     "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
     "designer.identify": "designer.gain designer.model designer.replay",
@@ -59,7 +61,7 @@ ROOMS = {
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
-    "designer.show": "agent.contract.recording",
+    "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
     "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
@@ -78,6 +80,7 @@ DOORS = {
     "cvxpy": ["designer/lmi/"],
     "clarabel": ["designer/lmi/"],
     "scipy": [
+        "designer/decay.py",
         "designer/lmi/",
         "designer/gain/products.py",
         "designer/proof/float_model.py",

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agent.contract.errors import InputError
+from agent.contract.errors import InputError, shortened
 
 
 def canonical(document: Any) -> bytes:
@@ -55,6 +55,20 @@ def writing_whole(path: Path, *, force: bool = False) -> Iterator[Path]:
         raise InputError(f"{path} could not be written: {error.strerror}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def read_json(data: bytes) -> Any:
+    """What JSON says. ValueError: it is none, or says a key twice, of which readers take one or the other."""
+    return json.loads(data, object_pairs_hook=_without_repeats)
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {shortened(repeated)} is there {names.count(repeated)} times; keep one of them")
+    return found
 
 
 def kind_of(data: bytes) -> str:

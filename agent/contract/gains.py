@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -11,11 +10,12 @@ from pydantic import Field, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
 from agent.contract.errors import InputError, listed
-from agent.contract.files import kind_of, read_bytes, write_whole
+from agent.contract.files import kind_of, read_bytes, read_json, write_whole
 from agent.contract.problem import Problem
 
 FORMAT = "peakmesh-gains"
 VERSION = 1
+_ENERGY = 1e-9  # that of `worst_case` may be off 1 by
 
 # gains[mode][i][j]: node i receives from node j; only where a_ij > 0 in that mode
 LinkMatrices = dict[str, dict[str, dict[str, Matrix]]]
@@ -96,7 +96,7 @@ class Gains(Model):
     def from_bytes(cls, data: bytes, *, source: str) -> Self:
         """Gains from the bytes of a gains.json; `source` names them in errors."""
         try:
-            document = json.loads(data)
+            document = read_json(data)
         except (ValueError, RecursionError) as error:
             kind = kind_of(data)
             why = f"it is {kind}" if kind in ("a recording", "a problem file") else f"it is not valid JSON: {error}"
@@ -159,6 +159,9 @@ class Gains(Model):
                 f"worst_case is {shape_text(self.worst_case)}; it needs a column for each disturbance of the plant, "
                 f"{self.problem.nw}"
             )
+        energy = 1.0 if self.worst_case is None else float((self.worst_case**2).sum())
+        if abs(energy - 1.0) > _ENERGY:
+            raise ValueError(f"worst_case has energy {energy:.9g}; it must be a sequence of energy 1")
         return self
 
 

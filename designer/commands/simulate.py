@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -213,4 +214,4 @@ def _finite(facts: Any) -> Any:
     """The same with None for what JSON has no number for."""
     if isinstance(facts, dict):
         return {key: _finite(value) for key, value in facts.items()}
-    return None if isinstance(facts, float) and abs(facts) == float("inf") else facts
+    return None if isinstance(facts, float) and not math.isfinite(facts) else facts

@@ -1,4 +1,4 @@
-"""`peakmesh verify`: a certificate proved again, without a solver."""
+"""`peakmesh verify`: a certificate proved again, without a solver, and of which problem it is."""
 
 from __future__ import annotations
 
@@ -6,14 +6,20 @@ import argparse
 import json
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from agent.commands.options import Subcommands, add_command, load_gains
-from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted, listed
+
+if TYPE_CHECKING:
+    from agent.contract.gains import Gains
+    from agent.contract.problem import Problem
 
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
     "exact": "mean-square stability by (17), and gamma by the recursion of the exact gain",
 }
+_BESIDE = {"name", "disturbance"}  # what a proof of gamma does not depend on
 
 
 def add_verify(commands: Subcommands) -> None:
@@ -21,17 +27,24 @@ def add_verify(commands: Subcommands) -> None:
     verify = add_command(commands, "verify", verify_command, "prove a certificate again, without a solver")
     verify.add_argument("gains", type=Path, metavar="GAINS", help="gains file")
     verify.add_argument(
+        "problem", nargs="?", metavar="PROBLEM", help="problem.toml, or a built-in problem, that they have to be for"
+    )
+    verify.add_argument(
         "--balls", action="store_true", help="in ball arithmetic alone: slower, and nothing is assumed of numpy"
     )
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def verify_command(options: argparse.Namespace) -> int:
-    """`peakmesh verify GAINS`."""
+    """`peakmesh verify GAINS [PROBLEM]`."""
+    from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
 
     gains = load_gains(options.gains)
+    differs = [] if options.problem is None else _differences(gains.problem, find(options.problem))
+    if set(differs) - _BESIDE:
+        return _for_another(gains, options, differs)
     started = time.perf_counter()
     try:
         verdict = verify(gains, makes=BALLS if options.balls else FLOATS + BALLS)
@@ -43,11 +56,71 @@ def verify_command(options: argparse.Namespace) -> int:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
     if options.json:
         said = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
-        print(json.dumps(verdict._asdict() | said))
-    elif verdict.holds:
-        print("\n".join([f"holds: gamma = {verdict.gamma} is proved", *(f"proved  {text}" for text in proved)]))
-        print(f"in      {how}")
+        print(json.dumps(verdict._asdict() | said | _of_problem(gains) | {"claimed": _claimed(gains, verdict.low)}))
+        return EXIT_GOOD if verdict.holds else EXIT_NO
+    lines = [f"of      {text}" for text in _whose(gains, differs)]
+    if verdict.holds:
+        if verdict.low is not None:
+            proved.append(f"the exact gain is between {verdict.low} and {verdict.gamma}: below, some w does worse")
+        lines = [f"holds: gamma = {verdict.gamma} is proved", *lines, *(f"proved  {text}" for text in proved)]
+        lines += [f"claimed {text}" for text in _claimed(gains, verdict.low)]
     else:
-        print(f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}")
-        print(f"in      {how}")
+        no = f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
+        lines = [no, *lines]
+    print("\n".join([*lines, f"in      {how}"]))
     return EXIT_GOOD if verdict.holds else EXIT_NO
+
+
+def _differences(found: Problem, wanted: Problem) -> list[str]:
+    """The parts of two problems that differ, as they are called in a problem file."""
+    one, other = found.document(), wanted.document()
+    return sorted(key for key in one.keys() | other.keys() if one.get(key) != other.get(key))
+
+
+def _for_another(gains: Gains, options: argparse.Namespace, differs: list[str]) -> int:
+    """The answer where the gains are for another problem than the one that is given."""
+    why = (
+        f"they are for another problem than {options.problem}: {listed(differs)} "
+        f"{'differ' if len(differs) > 1 else 'differs'}; {_whose(gains, [])[0]}"
+    )
+    if options.json:
+        print(json.dumps({"holds": False, "gamma": gains.certificate.gamma, "failure": why, **_of_problem(gains)}))
+    else:
+        print(f"does not hold: {options.gains} proves nothing of {options.problem}: {why}")
+    return EXIT_NO
+
+
+def _of_problem(gains: Gains) -> dict[str, object]:
+    from designer.problems import is_another
+
+    return {
+        "problem": gains.problem.name,
+        "problem_digest": gains.problem_digest,
+        "is_another": is_another(gains.problem),
+    }
+
+
+def _whose(gains: Gains, differs: list[str]) -> list[str]:
+    """Of which problem something is said."""
+    from designer.problems import is_another
+
+    problem = gains.problem
+    lines = [
+        f"{problem.name}, digest {gains.problem_digest[:12]}...: {counted(problem.n, 'node')}, "
+        f"{counted(problem.nx, 'state')}, {counted(len(problem.topologies), 'mode')}"
+    ]
+    if is_another(problem):
+        lines.append(f"a problem that is NOT the built-in one of the name {problem.name}")
+    if differs:
+        lines.append(f"a problem that differs from the one given in {listed(differs)}, on which no proof depends")
+    return lines
+
+
+def _claimed(gains: Gains, low: float | None) -> list[str]:
+    """What stands in the file too, and is not proved here."""
+    beside = ("floor", "lmi_gamma", "lmi_exact", *(("exact",) if low is None else ()))
+    there = [name for name in beside if getattr(gains.certificate, name) is not None]
+    found = [f"{listed(there)}: computed by whoever designed the gains"] if there else []
+    if gains.worst_case is not None:
+        found.append("worst_case: a w of energy 1; that no other fixed w does worse is not proved")
+    return found

@@ -14,8 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
+from designer.decay import decay
 from designer.gain.products import Collected, Pattern, Products
 from designer.model.error_model import ErrorModel, LinkTerms
+from designer.model.units import natural_scale
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
@@ -62,6 +64,7 @@ class Operator:
         self.transition = model.transition / model.transition.sum(axis=1, keepdims=True)
         self.p, self.size, self.nw = model.plant_states, size, model.nw
         self.eye_w = np.eye(self.nw)
+        self.units = natural_scale(model)
 
     def bar(self, Y: Array) -> Array:
         """Y_bar(s) = sum_t pi_st Y(t), (modes, n_eta, n_eta)."""
@@ -301,43 +304,18 @@ def _impulse(operator: Operator) -> float:
 def lyapunov(operator: Operator) -> tuple[Array | None, float]:
     """P(s) that satisfies (17) strictly, (modes, n_eta, n_eta), and the spectral radius of L.
 
-    P0 = I + L(I) + ... + L^k(I) with L^(k+1)(I) < I/2 has V = P0 - L(P0) > I/2. By Schur's complement c P0
-    satisfies (17) if and only if I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where the powers of L
-    grow, at a rate that has settled.
+    P0 > 0 with V = P0 - L(P0) > 0 is that of `designer.decay`. By Schur's complement c P0 satisfies (17) if and only if
+    I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where floats find no such P0.
     """
-    term = np.broadcast_to(np.eye(operator.size), operator.MM.shape)
-    P0, sizes = term.copy(), [0.0]  # logarithms of the norms of L^k(I)
-    while len(sizes) < _MOST_STEPS:
-        term = operator.corner(term)
-        largest = float(np.abs(term).sum(axis=2).max())
-        sizes.append(math.log(largest) if largest > 0.0 else -math.inf)
-        if largest < 0.5:  # a bound on every eigenvalue
-            return _scaled(operator, P0, term), _rate(sizes)
-        if _grows(sizes):
-            break
-        P0 = P0 + term
-    return None, _rate(sizes)
+    found = decay(operator.corner, len(operator.MM), operator.units)
+    if found.total is None or found.rest is None or not found.dies_out:
+        return None, found.radius
+    return _scaled(operator, found.total, found.rest), found.radius
 
 
-def _scaled(operator: Operator, P0: Array, last: Array) -> Array:
-    """c P0 with the largest c that (17) allows, but for the factor _STRICT; last = L^(k+1)(I)."""
-    V = np.eye(operator.size) - last  # P0 - L(P0)
+def _scaled(operator: Operator, P0: Array, V: Array) -> Array:
+    """c P0 with the largest c that (17) allows, but for the factor _STRICT; V = P0 - L(P0)."""
     S = operator.joint(operator.bar(P0))
     AB, BB = S[:, : operator.size, operator.size :], S[:, operator.size :, operator.size :]
     worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
     return np.asarray(P0 / (worst * _STRICT))
-
-
-def _rate(sizes: list[float]) -> float:
-    """Growth per step over the last half."""
-    half = (len(sizes) - 1) // 2
-    return math.exp((sizes[-1] - sizes[half]) / (len(sizes) - 1 - half))
-
-
-def _grows(sizes: list[float]) -> bool:
-    """Whether the norms grow at a rate that has settled, so that it is no transient; asked at steps 32, 64, 128, ..."""
-    k = len(sizes) - 1
-    if k < 32 or k & (k - 1):
-        return False
-    early, late = sizes[k // 2] - sizes[k // 4], sizes[k] - sizes[k // 2]
-    return late > 0.0 and abs(late - 2.0 * early) < 0.02 * late

@@ -9,10 +9,12 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from designer.model.error_model import ErrorModel
 
 _DOUBLINGS = 20  # 2^20 terms of the sum of A^k B B' A'^k
 _DAMPED = 0.95
 _FEW = 8
+_STEPS_OF_SCALE = 8
 
 
 class Units(NamedTuple):
@@ -41,6 +43,22 @@ def natural_units(problem: Problem) -> Units:
     state = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
     error = math.sqrt(max(problem.n / _FEW, 1.0))
     return Units(state, float(np.linalg.norm(problem.plant.M * state, 2)) or 1.0, error)
+
+
+def natural_scale(model: ErrorModel) -> Array:
+    """For each entry of eta a power of two, 1 over about what w of energy 1 makes of it within a few steps, (n_eta,).
+
+    The errors of a state have its unit. A state that w does not reach has the largest of the others.
+    """
+    reach, moved, nx = np.zeros((model.modes, model.size)), model.B, model.H.shape[1] // len(model.rows)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_STEPS_OF_SCALE):
+            reach += (moved**2).sum(axis=2)
+            moved = model.A @ moved
+    of_state = reach.reshape(-1, nx).max(axis=0)
+    known = (of_state > 0.0) & np.isfinite(of_state)
+    of_state = np.where(known, of_state, of_state[known].max(initial=0.0) or 1.0)
+    return np.tile(np.exp2(np.round(-np.log2(of_state) / 2.0)), model.size // nx)
 
 
 def rescaled(problem: Problem, units: Units) -> Problem:

@@ -17,11 +17,20 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(_SUFFIX) for name in found if name.endswith(_SUFFIX)))
 
 
+def is_another(problem: Problem) -> bool:
+    """Whether it bears the name of a built-in problem, and is not that one."""
+    return problem.name in names() and _built_in(problem.name).digest() != problem.digest()
+
+
+def _built_in(name: str) -> Problem:
+    with as_file(files(__name__) / f"{name}{_SUFFIX}") as path:
+        return Problem.load(path)
+
+
 def find(text: str) -> Problem:
     """A built-in problem by its name, or the problem file at that path. Raises InputError where there is neither."""
     if text in names():
-        with as_file(files(__name__) / f"{text}{_SUFFIX}") as path:
-            return Problem.load(path)
+        return _built_in(text)
     if not Path(text).exists():
         raise InputError(f'"{text}" is neither a problem file nor a built-in problem; built in are {listed(names())}')
     return Problem.load(Path(text))

@@ -44,6 +44,15 @@ class ByBalls:
         with ctx.workprec(self.bits):
             return [sign(P_s, diagonal(P_s)) for P_s in symmetric(P)]
 
+    def decreasing(self, Z: Array) -> list[Sign]:
+        eta = self.model.eta
+        with ctx.workprec(self.bits):
+            rests = [
+                Z_s - part(S, eta, eta)
+                for S, Z_s in zip(self.model.joint(symmetric(Z), _blocks(self.model, Z)), symmetric(Z), strict=True)
+            ]
+            return [sign(rest, np.abs(diagonal(rest))) for rest in rests]
+
     def start(self, *, up: bool) -> list[arb_mat]:
         with ctx.workprec(self.bits):
             return [_rounded(self.model.MM, up=up)] * len(self.model.AB)

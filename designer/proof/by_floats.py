@@ -54,6 +54,15 @@ class ByFloats:
     def positive(self, P: Array) -> list[Sign]:
         return self._less(np.zeros_like(P), P, 1.0)
 
+    @np.errstate(all="ignore")  # what is not finite decides nothing
+    def decreasing(self, Z: Array) -> list[Sign]:
+        Z, n = symmetric(Z), self.model.size
+        S = self.model.joint(Z)
+        if S is None:
+            return self._undecided
+        rest = difference(Z, Bounded(S.middle[:, :n, :n], S.spread[:, :n]))
+        return self._signs(rest, np.abs(rest.middle))
+
     def start(self, *, up: bool) -> Array:
         MM = raised(self.model.peak, up=up)
         return np.tile(MM, (self.model.modes, 1, 1))

@@ -29,8 +29,20 @@ def verify(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Verdict:
         raise InputError(f"certificate: horizon is {most}; a proof takes from 1 to {MOST_STEPS} steps")
     if claim.kind == "lyapunov":
         return prover.theorem1(claim.gamma)
-    verdict = prover.exact(claim.gamma, most=MOST_STEPS if most is None else most)
+    verdict = _with_lower_end(claim, prover, prover.exact(claim.gamma, most=MOST_STEPS if most is None else most))
     return verdict if claim.theorem1_gamma is None else verdict.joined(prover.theorem1(claim.theorem1_gamma))
+
+
+def _with_lower_end(claim: Certificate, prover: Prover, verdict: Verdict) -> Verdict:
+    """That the exact gain is not below the lower end that the file gives: proved, left open, or proved false."""
+    if claim.exact is None or not verdict.holds:
+        return verdict
+    low = claim.exact[0]
+    if low <= claim.gamma and (low <= 0.0 or prover.at_least(low) is not None):
+        return verdict._replace(low=low)
+    if low > claim.gamma or prover.exact(low).holds:
+        return verdict._replace(holds=False, failure=f"the exact gain is below {low}, where the file says it begins")
+    return verdict
 
 
 def prover_of(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Prover:

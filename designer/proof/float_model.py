@@ -7,6 +7,7 @@ to S(Y) is linear in them. docs/theory.md, section 4, counts the roundings.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from agent.contract.arrays import Array
+from designer.decay import Decay, decay
 from designer.proof.ball_model import BallModel
-from designer.proof.float64 import LARGEST, TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
+from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 
 Indices = NDArray[np.int64]
 
-_MOST_TERMS = 20_000  # of the sum that P is
 _STEPS_OF_REACH = 8
 _STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
 
@@ -87,29 +88,25 @@ class FloatModel:
         """Y_bar(s) = sum_t pi_st Y(t)."""
         return product(transition, Y.reshape(self.modes, -1)).reshape(Y.shape)
 
+    @cached_property
+    @np.errstate(all="ignore")
+    def decay(self) -> Decay:
+        """Of L, and what solves Z - L(Z) > 0, found and not proved."""
+        return decay(lambda Y: self.weigh(Y)[:, : self.size, : self.size], self.modes, weights(self._reach()))
+
     @np.errstate(all="ignore")
     def lyapunov(self) -> Array | None:
         """P(s) for (17), (modes, n_eta, n_eta), found and not proved; None where the errors do not decay.
 
-        P0 = U + L(U) + ... + L^k(U) with L^(k+1)(U) < U/2, V = P0 - L(P0) > U/2, and the largest c P0, but for a
-        factor: by Schur's complement I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). U is I in natural units.
+        With P0 > 0 and V = P0 - L(P0) > 0, the largest c P0, but for a factor: by Schur's complement
+        I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B).
         """
-        n, D = self.size, weights(self._reach())
-        term = np.broadcast_to(np.diag(D * D), (self.modes, n, n))
-        P0 = term.copy()
-        for _ in range(_MOST_TERMS):
-            term = self.weigh(term)[:, :n, :n]
-            largest = (times(np.abs(term), 1.0 / D) / D).max()  # a bound on every eigenvalue, relative to U
-            if largest < 0.5:
-                break
-            if not largest < LARGEST:
-                return None
-            P0 = P0 + term
-        else:
+        P0, V, n = self.decay.total, self.decay.rest, self.size
+        if P0 is None or V is None or not self.decay.dies_out:
             return None
         S = self.weigh(P0)
         AB, BB = S[:, :n, n:], S[:, n:, n:]
-        worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(np.diag(D * D) - term, AB)).max())
+        worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
         return P0 / (worst * _STRICT) if worst > 0.0 else P0
 
     def _reach(self) -> Array:

@@ -27,11 +27,23 @@ BALLS: tuple[Make, ...] = tuple(partial(ByBalls, bits=bits) for bits in (128, 25
 _LARGEST_RECURSION = 130
 _LARGEST_INEQUALITY = 450
 _STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
+_STEPS_OF_LOWER_END = 20_000
 
 
 class _Answer(NamedTuple):
     findings: list[Finding]
     arithmetic: str
+
+
+class Stability(NamedTuple):
+    """Whether the errors are mean-square stable: proved, proved not to be, or not known."""
+
+    holds: bool | None
+    arithmetic: str
+
+    @property
+    def word(self) -> str:
+        return {True: "proved", False: "proved false", None: "not known"}[self.holds]
 
 
 class Prover:
@@ -77,6 +89,32 @@ class Prover:
         if any(refuted(answer.findings) for answer in answers):
             return _verdict(gamma, answers)
         return _verdict(gamma, [*self._disproof(gamma), *answers])
+
+    def at_least(self, gamma: float, *, most: int = _STEPS_OF_LOWER_END) -> str | None:
+        """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps."""
+        for k in range(len(self._makes)):
+            by = self._arithmetic(k)
+            if k and by.order > _LARGEST_RECURSION:
+                break
+            steps = most if k == 0 else min(most, _STEPS_OF_DISPROOF)
+            if disproof(by, self._problem.mode_names, gamma, most=steps, P=self.P) is not None:
+                return by.name
+        return None
+
+    @cached_property
+    def stable(self) -> Stability:
+        """By (17) and P > 0, or else by Z of `designer.decay`: Z - L(Z) > 0, and Z > 0 or some v'Z(s)v < 0."""
+        if self.P is not None and all(proved(answer.findings) for answer in self._stability):
+            return Stability(True, self._stability[0].arithmetic)
+        Z, modes = self._floats.model.decay.total, self._problem.mode_names
+        if Z is None:
+            return Stability(None, self._floats.name)
+        falls = self._ask(lambda by: found("Z > L(Z)", modes, by.decreasing(Z)), largest=_LARGEST_INEQUALITY)
+        signs = self._ask(lambda by: found("Z > 0", modes, by.positive(Z)), largest=_LARGEST_INEQUALITY)
+        arithmetic = "; ".join(dict.fromkeys([falls.arithmetic, signs.arithmetic]))
+        if not proved(falls.findings):
+            return Stability(None, arithmetic)
+        return Stability(proved(signs.findings) or (False if refuted(signs.findings) else None), arithmetic)
 
     @cached_property
     def _inequality_17(self) -> _Answer:
@@ -126,8 +164,13 @@ class Prover:
         answers = self._disproof(gamma)
         if answers:
             return _verdict(gamma, answers)
-        why = "no P for (17) was found: as far as floats tell, the errors are not mean-square stable"
-        return Verdict(False, gamma, self._arithmetic(0).name, why, {})
+        why, stable = (
+            "no P for (17) was found, and it is not known whether the errors are mean-square stable",
+            self.stable,
+        )
+        if stable.holds is False:
+            why = "the errors are not mean-square stable, which is proved: from some start they never die out"
+        return Verdict(False, gamma, stable.arithmetic, why, {})
 
 
 def _verdict(gamma: float, answers: Sequence[_Answer]) -> Verdict:

@@ -42,6 +42,9 @@ class Arithmetic(Protocol):
     def positive(self, P: Array) -> list[Sign]:
         """P(s) > 0."""
 
+    def decreasing(self, Z: Array) -> list[Sign]:
+        """Z(s) - L(Z)(s) > 0, for any symmetric Z."""
+
     def start(self, *, up: bool) -> Any:
         """Y = M'M in every mode."""
 
@@ -76,10 +79,19 @@ def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, m
     return [*every, end]
 
 
-def disproof(arithmetic: Arithmetic, modes: Modes, gamma: float, *, most: int) -> Finding | None:
-    """A W that is proved not to be positive definite within so many steps: gamma is below the exact gain; or None."""
-    Y = arithmetic.start(up=False)
+def disproof(
+    arithmetic: Arithmetic, modes: Modes, gamma: float, *, most: int, P: Array | None = None
+) -> Finding | None:
+    """A W that is proved not to be positive definite within so many steps: gamma is below the exact gain; or None.
+
+    P, which satisfies (17), ends the search where there will be none.
+    """
+    Y, next_look = arithmetic.start(up=False), 1
     for step in range(1, most + 1):
+        if P is not None and step >= next_look:
+            if _seems_below(arithmetic.floats(Y), P, gamma):
+                break
+            next_look = step + 1 + step // 16
         signs, Y = arithmetic.step(Y, gamma, up=False)
         false = [finding for finding in found("recursion", modes, signs, _at(step, gamma)) if finding.sign.refuted]
         if false:

@@ -33,7 +33,7 @@ from places import ROOT
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.files import canonical
-from agent.contract.gains import Gains
+from agent.contract.gains import Certificate, Gains, Solver
 from agent.contract.problem import Problem
 from designer import simulation
 from designer.cli import main
@@ -302,7 +302,9 @@ def ensemble_of(sizes: Array, *, gamma: float = 1.0) -> Ensemble:
         part = rows.T
         largest, others = simulation._set_apart(part, ignored)
         squares = ((part - part.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
-        tally = simulation.Tally(part.shape[1], part.mean(axis=1), squares, largest, others, np.sqrt(part.max(axis=0)))
+        tally = simulation.Tally(
+            part.shape[1], part.mean(axis=1), squares, largest, others, part.mean(axis=1), np.sqrt(part.max(axis=0))
+        )
         found = tally if found is None else simulation._together(found, tally, ignored)
     assert found is not None
     return simulation._ensemble(gamma, found, np.ones(steps))
@@ -339,9 +341,41 @@ def test_what_is_clearly_too_much_is_refuted() -> None:
     assert ensemble_of(sizes, gamma=1.4).refuted_at is None
 
 
+def exactly_measured() -> Gains:
+    """Two nodes that measure w itself: their errors are the rounding of the gains, 2e-17 of w or less."""
+    rng = np.random.default_rng(23)
+    A, B = np.array([[0.19, 0.075], [-0.02, -0.8]]), rng.normal(size=(2, 2))
+    sensor = {"C": np.zeros((2, 2)).tolist(), "D": np.eye(2).tolist(), "arrival_probability": 1.0}
+    problem = Problem.from_document(
+        {
+            "name": "w-measured",
+            "plant": {"A": A.tolist(), "B": B.tolist(), "M": [[0.83, 0.83]]},
+            "node": [{"name": name, **sensor} for name in "ab"],
+            "topology": [{"name": "t", "hears": {"b": ["a"]}}],
+            "markov": {"transition": [[1.0]], "initial": "t"},
+            "disturbance": {"kind": "white", "deviation": 1.0},
+        }
+    )  # fmt: skip
+    other = B - 0.3 * B
+    K = {"t": {"a": {"a": A}, "b": {"a": 0.3 * A, "b": A - 0.3 * A}}}
+    H = {"t": {"a": {"a": B}, "b": {"a": 0.3 * B, "b": other}}}
+    claim = Certificate(gamma=1e-16, kind="exact", form="summed", holds=True, verified="by hand", margins={})
+    solver = Solver(name="none", version="-", status="by hand", iterations=0, seconds=0.0)
+    parts = {"problem": problem, "problem_digest": problem.digest(), "method": "given", "seconds": {}}
+    return Gains(**parts, K=K, H=H, certificate=claim, solver=solver)
+
+
+def test_rounding_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gamma of 1e-16 is true, and the simulation's own rounding is more than that: it knows how much more."""
+    gains = exactly_measured()
+    assert simulation.simulate(gains, runs=400, steps=8).refuted_at is None
+    monkeypatch.setattr(simulation, "_rounding", lambda *given: np.zeros(8))
+    assert simulation.simulate(gains, runs=400, steps=8).refuted_at is not None
+
+
 def test_errors_beyond_float64_refute() -> None:
     """Gains that let errors grow without end."""
-    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)))
+    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.full((2, 2, 2), 0.5))
     gains = claiming(uncertified(sticky(), K, H, method="none"), 1.0)
     ensemble = simulation.simulate(gains, runs=20, steps=400, w=np.ones((1, 3)), processes=1)
     assert np.isinf(ensemble.mean[-1])
@@ -512,7 +546,7 @@ def test_a_gamma_that_is_too_low_is_refuted_with_exit_code_1(
 
 
 def test_what_is_beyond_float64_is_null(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2)))
+    K, H = link_gains(sticky(), 3.0 * np.tile(np.eye(2), (2, 1, 1)), np.full((2, 2, 2), 0.5))
     gains = uncertified(sticky(disturbance={"kind": "impulse"}), K, H, method="none")
     assert simulate_command(tmp_path, "--steps", 400, "--runs", 20, "--json", gains=gains) == 1
     facts = json.loads(capsys.readouterr().out)

@@ -7,7 +7,6 @@ format that it states, gains by the digest that their run names.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from functools import reduce
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from agent.contract.errors import InputError, listed
+from agent.contract.files import read_json
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.recording import FORMAT, VERSION
@@ -191,11 +191,18 @@ def _no_gains(failures: list[str], wanted: str, surveys: Sequence[Survey], label
     return f"{label} has no gains: its attachment gains.json is missing, a filter may have left it out; {hint}"
 
 
-def unfit(run: Run, surveys: Sequence[Survey]) -> Iterator[tuple[str, bool]]:
+def unfit(run: Run, surveys: Sequence[Survey], used: Gains | None) -> Iterator[tuple[str, bool]]:
     """Of the attachments whose digests the run names, those of which there is none that fits: a sentence, and whether
-    a checksum vouches for what is there, so that somebody has altered it; else it is damaged, or may be."""
+    a checksum vouches for what is there, so that somebody has altered it; else it is damaged, or may be.
+
+    Where the run names none, and where it names others, the gains that are `used` and their problem count.
+    """
+    ours = {} if used is None else {"gains": used.digest(), "problem_digest": used.problem_digest}
     for name, key, model in _DIGESTS:
-        wanted = run.facts.get(key, "")
+        named = run.facts.get(key, "")
+        wanted = ours.get(key, named)
+        if named not in ("", wanted):
+            yield f"the run names {name} of digest {named[:12]}..., and was held against {wanted[:12]}...", True
         there = list(_named(name, surveys))
         found = [_digest(survey, attached, model, wanted) for survey, attached in there]
         if not wanted or not found or wanted in found:
@@ -232,7 +239,7 @@ def _digest(survey: Survey, attached: Attached, model: type[Problem] | type[Gain
     if hashlib.sha256(data).hexdigest() == wanted:
         return wanted
     try:
-        return model.model_validate(json.loads(data)).digest()
+        return model.model_validate(read_json(data)).digest()
     except (ValueError, RecursionError):
         return hashlib.sha256(data).hexdigest()
 

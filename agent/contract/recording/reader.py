@@ -114,7 +114,7 @@ class RecordingReader:
 
     @cached_property
     def _unfit(self) -> list[tuple[str, bool]]:
-        return list(contents.unfit(self._chosen, self._surveys))
+        return list(contents.unfit(self._chosen, self._surveys, self._gains))
 
     @property
     def damages(self) -> list[str]:

@@ -54,6 +54,50 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "ladder     1.414214  floor\n" in printed
 
 
+def test_verify_says_of_which_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """gamma of another plant under a famous name is proved, and the name is not lent to it."""
+    assert run("design", "two-nodes", "-o", "true.json") == 0
+    text = (ROOT / "designer" / "problems" / "two-nodes.toml").read_text()
+    first = next(line for line in text.splitlines() if line.startswith("M = "))
+    Path("other.toml").write_text(text.replace(first, "M = [[0.5]]"))
+    assert run("design", "other.toml", "-o", "false.json") == 0
+    capsys.readouterr()
+    assert run("verify", "true.json", "two-nodes") == 0
+    printed = capsys.readouterr().out
+    assert "of      two-nodes, digest " in printed
+    assert "NOT" not in printed
+    assert run("verify", "false.json") == 0
+    assert "NOT the built-in one of the name two-nodes" in capsys.readouterr().out
+    assert run("show", "false.json") == 0
+    assert "NOT the built-in problem of this name" in capsys.readouterr().out
+    assert run("verify", "false.json", "two-nodes") == 1
+    assert 'another problem than two-nodes: "plant" differs' in capsys.readouterr().out
+    assert run("verify", "false.json", "two-nodes", "--json") == 1
+    assert json.loads(capsys.readouterr().out)["holds"] is False
+    assert run("verify", "false.json", "other.toml") == 0
+
+
+def test_no_proof_depends_on_a_name(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    text = (ROOT / "designer" / "problems" / "two-nodes.toml").read_text()
+    Path("renamed.toml").write_text(text.replace('name = "two-nodes"', 'name = "renamed"', 1))
+    capsys.readouterr()
+    assert run("verify", "gains.json", "renamed.toml") == 0
+    assert 'differs from the one given in "name", on which no proof depends' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", [("verify",), ("show",), ("analyse", "two-nodes", "--gains")])
+def test_a_key_that_is_there_twice_is_refused(
+    command: tuple[str, ...], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Readers of JSON take the first or the last of them, so nobody may be shown one and prove the other."""
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    data = Path("gains.json").read_bytes()
+    Path("twice.json").write_bytes(data.replace(b'"certificate":{', b'"certificate":{"gamma":0.001,', 1))
+    assert run(*command, "twice.json") == 2
+    assert "the key 'gamma' is there 2 times; keep one of them" in capsys.readouterr().err
+
+
 def test_the_default_of_a_large_problem(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,7 +25,8 @@ from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.gain.exact import Operator, exact_gain, horizon_gain
+from designer.decay import decay
+from designer.gain.exact import Operator, _scaled, exact_gain, horizon_gain
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
@@ -60,13 +61,21 @@ def model_of(gains: Gains) -> ErrorModel:
     return error_model(gains.problem, *stacked_gains(gains))
 
 
+def tight_P(model: ErrorModel) -> Array:
+    """A P that changes of the gains or of the modes break: the sum of the powers of L from I, whatever the units."""
+    operator = Operator(model)
+    found = decay(operator.corner, model.modes, np.ones(model.size))
+    assert found.total is not None
+    assert found.rest is not None
+    return _scaled(operator, found.total, found.rest)
+
+
 def certified(problem: Problem, kind: Kind) -> Gains:
     """Kalman-consensus gains with a certificate as tight as `design` makes it, by floats alone."""
     K, H = link_gains(problem, *consensus_gains(problem, weight=0.2))
     model = error_model(problem, *stacked_links(problem, K, H))
-    gain = exact_gain(model)
-    assert gain.P is not None
-    gamma = gain.high if kind == "exact" else least_gamma(model.M, gain.P) * (1.0 + 1e-9)
+    gain, P = exact_gain(model), tight_P(model)
+    gamma = gain.high if kind == "exact" else least_gamma(model.M, P) * (1.0 + 1e-9)
     return Gains(
         problem=problem,
         problem_digest=problem.digest(),
@@ -77,7 +86,7 @@ def certified(problem: Problem, kind: Kind) -> Gains:
             gamma=gamma,
             kind=kind,
             form="full",
-            P=dict(zip(problem.mode_names, gain.P, strict=True)),
+            P=dict(zip(problem.mode_names, P, strict=True)),
             exact=(gain.low, gain.high),
             holds=True,
             verified="by nobody yet",
@@ -247,9 +256,8 @@ def test_gains_whose_bound_is_false_are_refused_whatever_P_is(kind: Kind, makes:
     """One gain is changed and P made anew: (17) is true again, and gamma, which was true before, is not."""
     mutant = mutated(ALL["real", kind], change_one_measurement_gain_a_little)
     gain = exact_gain(model_of(mutant))
-    assert gain.P is not None
     assert gain.low > ALL["real", "exact"].certificate.gamma, "this mutant is no mutant"
-    P = dict(zip(mutant.problem.mode_names, gain.P, strict=True))
+    P = dict(zip(mutant.problem.mode_names, tight_P(model_of(mutant)), strict=True))
     claim = mutant.certificate.model_copy(update={"P": P})
     verdict = verify(mutant.model_copy(update={"certificate": claim}), makes=makes)
     assert verdict.failure is not None
@@ -442,8 +450,38 @@ def test_gains_that_are_not_stable_have_no_P(makes: Sequence[Make]) -> None:
         assert prover_of.P is None
         for verdict in (prover_of.exact(10.0), prover_of.theorem1(10.0)):
             assert said(verdict) == answer
-            why = "recursion fails" if answer == "false" else "no P for (17) was found: as far as floats tell, the "
+            why = "recursion fails" if answer == "false" else "the errors are not mean-square stable, which is proved"
             assert str(verdict.failure).startswith(why)
+
+
+@every_arithmetic
+@every_network
+def test_the_interval_of_the_exact_gain_is_proved(network: str, makes: Sequence[Make]) -> None:
+    """Both ends; a lower end that is too high by 1e-5 is proved false where gamma itself allows for it."""
+    gains = ALL[network, "exact"]
+    low, high = gains.certificate.exact or (0.0, 0.0)
+    proved = low * (1.0 - 1e-9)
+
+    def saying(low: float, gamma: float = high) -> Verdict:
+        claim = gains.certificate.model_copy(update={"exact": (low, high), "gamma": gamma})
+        return verify(gains.model_copy(update={"certificate": claim}), makes=makes)
+
+    assert saying(proved).low == proved
+    assert saying(low / 2.0).low == low / 2.0
+    assert saying(high * (1.0 + 1e-5), 2.0 * high).failure == (
+        f"the exact gain is below {high * (1.0 + 1e-5)}, where the file says it begins"
+    )
+    assert not saying(high * (1.0 + 1e-5)).holds
+
+
+def test_what_no_w_attains_is_not_proved_to_be_attained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither without steps, nor where the recursion is rounded the other way."""
+    gains = ALL["real", "exact"]
+    low = (gains.certificate.exact or (0.0, 0.0))[0] * (1.0 - 1e-9)
+    prover = Prover(gains.problem, gains.K, gains.H)
+    assert prover.at_least(low) is not None
+    assert prover.at_least(low, most=1) is None
+    assert prover.at_least(gains.certificate.gamma * (1.0 + 1e-6)) is None
 
 
 @every_arithmetic
@@ -538,7 +576,7 @@ def test_without_some_chance_a_false_certificate_would_pass(
     gain = exact_gain(replace(model, **without[kept]))
     assert gain.P is not None
     P = dict(zip(gains.problem.mode_names, gain.P, strict=True))
-    updated = {"P": P, "gamma": gain.high * (1.0 + 1e-6)}
+    updated = {"P": P, "gamma": gain.high * (1.0 + 1e-6), "exact": None}
     false = gains.model_copy(update={"certificate": gains.certificate.model_copy(update=updated)})
     assert not verify(false, makes=makes).holds
     for module in ("by_balls", "by_floats"):

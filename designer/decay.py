@@ -1,0 +1,183 @@
+"""Whether what a linear system with chance holds dies out, and how fast: of the map L that its covariances follow.
+
+L takes a family of symmetric matrices, one for each mode, to the mean of Y one step later; where Y rises, so does
+L(Y). The errors are mean-square stable if and only if the powers of L decay, and then Z = U + L(U) + L^2(U) + ... is
+the only solution of Z - L(Z) = U. For U > 0 that equation decides both ways (docs/theory.md, section 3):
+
+* if Z > 0, L^k(Z) falls to 0, so the errors die out;
+* if some v'Z(s)v < 0, then -Z <= L(-Z) <= L^2(-Z) <= ..., and E eta(k)'(-Z)eta(k) from eta(0) = v never falls below
+  its start, which is above 0: these errors do not die out.
+
+All that is found here is found in floats; what is claimed of it is proved in designer/proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.arrays import Array
+
+Map = Callable[[Array], Array]
+
+_TERMS = 300  # that are added one by one, which rounds least; what decays more slowly is solved for
+_DENSE = 1000  # unknowns up to which L is written out as a matrix
+_FEW = 40  # and up to which its eigenvalues take no time
+_TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to rounding, and Arnoldi's method most of all
+_STEPS = 30  # in which it is looked for
+_HUGE = 1e150
+_REST = 0.25  # what is left of U may be off by, measured by U
+
+
+class Decay(NamedTuple):
+    """Z, (modes, n, n), with Z - L(Z) = rest > 0, or None where floats find none that surely has; and the radius."""
+
+    total: Array | None
+    rest: Array | None
+    radius: float  # spectral radius of L
+
+    @property
+    def dies_out(self) -> bool:
+        """As far as floats tell; that it is not so is not known from this alone."""
+        return self.total is not None and is_positive(self.total)
+
+
+def decay(L: Map, modes: int, units: Array) -> Decay:
+    """Of L on (modes, n, n); `units` (n,): powers of two in which the numbers are near 1, U = diag(units^2)."""
+    n, both = len(units), np.outer(units, units)
+
+    def scaled(Y: Array) -> Array:
+        X = L(Y * both) / both
+        return np.asarray((X + X.swapaxes(1, 2)) / 2.0)
+
+    total, rest = _total(scaled, modes, n)
+    radius = spectral_radius(scaled, modes, n)
+    return Decay(None if total is None else total * both, None if rest is None else rest * both, radius)
+
+
+def is_positive(Z: Array) -> bool:
+    """Whether every Z(s) is positive definite, by Cholesky, in units in which its diagonal is 1."""
+    sizes = np.sqrt(np.abs(Z.diagonal(axis1=1, axis2=2)))
+    if not (np.isfinite(Z).all() and (sizes > 0.0).all()):
+        return False
+    try:
+        np.linalg.cholesky(Z / sizes[:, :, None] / sizes[:, None])
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _total(L: Map, modes: int, n: int) -> tuple[Array | None, Array | None]:
+    """Z and Z - L(Z) for U = I, which is in the middle of what is allowed for."""
+    eye = np.broadcast_to(np.eye(n), (modes, n, n))
+    total, term = eye.copy(), eye
+    for _ in range(_TERMS):
+        term = L(term)
+        largest = float(np.abs(term).sum(axis=2).max())  # a bound on every eigenvalue
+        if largest < 0.5:
+            return total, eye - term
+        if not largest < _HUGE:
+            break
+        total = total + term
+    Z = _solved(L, modes, n)
+    if Z is None or not np.isfinite(Z).all() or np.abs(Z).max() > _HUGE:
+        return None, None
+    rest = Z - L(Z)
+    return (Z, rest) if np.abs(rest - eye).sum(axis=2).max() < 2.0 * _REST else (None, None)
+
+
+def _solved(L: Map, modes: int, n: int) -> Array | None:
+    """Z of Z - L(Z) = I, as exactly as is enough."""
+    pack, unpack = _packing(modes, n)
+    right, order = pack(np.broadcast_to(np.eye(n), (modes, n, n))), modes * n * (n + 1) // 2
+    if order <= _DENSE:
+        I_L = np.eye(order) - _matrix(L, modes, n)
+        if not np.isfinite(I_L).all():
+            return None
+        try:
+            z = np.linalg.solve(I_L, right)
+            return unpack(z + np.linalg.solve(I_L, right - I_L @ z))
+        except np.linalg.LinAlgError:
+            return None
+    from scipy.sparse.linalg import LinearOperator, gmres
+
+    I_L = LinearOperator((order, order), matvec=lambda z: z - pack(L(unpack(z))), dtype=np.float64)
+    z, _ = gmres(I_L, right, rtol=_REST / np.sqrt(modes * n), restart=60, maxiter=5)
+    return unpack(z)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def spectral_radius(L: Map, modes: int, n: int) -> float:
+    """Of L; by its eigenvalues, of large ones by Arnoldi's method. Infinite where L overflows."""
+    pack, unpack = _packing(modes, n)
+    order = modes * n * (n + 1) // 2
+    first = pack(L(np.broadcast_to(np.eye(n), (modes, n, n))))
+    if not np.isfinite(first).all():
+        return np.inf
+    if order > _FEW:
+        from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
+
+        operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
+        try:
+            found = eigs(operator, k=1, v0=first + 1e-30, tol=1e-10, maxiter=60, return_eigenvectors=False)
+            radius = float(np.abs(found).max())
+            if order > 2 * _DENSE or not _has_transient(L, modes, n, radius):
+                return radius
+        except ArpackError:
+            pass
+    if order > 2 * _DENSE:
+        return _rate(L, unpack(first))
+    M = _matrix(L, modes, n)
+    return float(np.abs(np.linalg.eigvals(M)).max()) if np.isfinite(M).all() else np.inf
+
+
+def _has_transient(L: Map, modes: int, n: int, radius: float) -> bool:
+    """Whether what is held grows by much before it decays or grows as it will."""
+    Y, log = np.broadcast_to(np.eye(n), (modes, n, n)), 0.0
+    for _ in range(_STEPS):
+        Y = L(Y)
+        size = float(np.abs(Y).max())
+        if not (size > 0.0 and radius > 0.0):
+            return False
+        Y, log = Y / size, log + float(np.log(size / radius))
+        if log > np.log(_TRANSIENT):
+            return True
+    return False
+
+
+def _rate(L: Map, Y: Array) -> float:
+    """Growth per step over the second half of many, where nothing better is to be had."""
+    logs = [0.0]
+    for _ in range(_TERMS):
+        Y = L(Y)
+        size = float(np.abs(Y).max())
+        if not size > 0.0:
+            return 0.0
+        Y, logs = Y / size, [*logs, logs[-1] + float(np.log(size))]
+    half = len(logs) // 2
+    return float(np.exp((logs[-1] - logs[half]) / (len(logs) - 1 - half)))
+
+
+def _packing(modes: int, n: int) -> tuple[Map, Map]:
+    """From symmetric matrices to vectors, in which they have the same norm, and back."""
+    rows, columns = np.triu_indices(n)
+    weights = np.where(rows == columns, 1.0, np.sqrt(2.0))
+
+    def pack(Y: Array) -> Array:
+        return np.asarray((Y[:, rows, columns] * weights).reshape(-1))
+
+    def unpack(y: Array) -> Array:
+        Y = np.empty((modes, n, n))
+        Y[:, rows, columns] = Y[:, columns, rows] = y.reshape(modes, -1) / weights
+        return Y
+
+    return pack, unpack
+
+
+def _matrix(L: Map, modes: int, n: int) -> Array:
+    """L in these vectors, (order, order)."""
+    pack, unpack = _packing(modes, n)
+    order = modes * n * (n + 1) // 2
+    return np.array([pack(L(unpack(unit))) for unit in np.eye(order)]).T

@@ -1,0 +1,147 @@
+"""Whether errors die out: three answers, each with a proof or none, whatever the units and however slowly."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from agent.contract.arrays import Array
+from agent.contract.gains import LinkMatrices
+from agent.contract.problem import Problem
+from designer import decay as module
+from designer.analysis import GivenGains, analyse
+from designer.decay import decay, spectral_radius
+from designer.gain.exact import Operator, exact_gain
+from designer.model.error_model import error_model, stacked_links
+from designer.proof.by_balls import ByBalls
+from designer.proof.by_floats import ByFloats
+from designer.proof.prover import BALLS, FLOATS, Prover
+
+Case = tuple[Problem, LinkMatrices, LinkMatrices]
+
+
+def scalar(radius: float) -> Case:
+    """One node that ignores all it measures: the error is the plant's own, and L is radius^2."""
+    return chain([radius])
+
+
+def chain(own: list[float]) -> Case:
+    """Unbiased nodes in a line, which measure nothing, with these K_ii; the first has A, the others hear one before."""
+    names = [f"n{i}" for i in range(len(own))]
+    node = {"C": [[1.0]], "D": [[0.1]], "arrival_probability": 0.9, "loss": "seen"}
+    problem = Problem.from_document(
+        {
+            "name": "chain",
+            "unbiased": True,
+            "plant": {"A": [[own[0]]], "B": [[1.0]], "M": [[1.0]]},
+            "node": [{"name": name, **node} for name in names],
+            "topology": [{"name": "t", "hears": {name: [before] for before, name in pairwise(names)}}],
+            "markov": {"transition": [[1.0]], "initial": "t"},
+        }
+    )
+    K: dict[str, dict[str, Array]] = {names[0]: {names[0]: np.array([[own[0]]])}}
+    for before, name, k in zip(names, names[1:], own[1:], strict=False):
+        K[name] = {before: np.array([[own[0] - k]]), name: np.array([[k]])}
+    H = {name: {heard: np.zeros((1, 1)) for heard in of_node} for name, of_node in K.items()}
+    return problem, {"t": K}, {"t": H}
+
+
+def in_units(case: Case, units: Array) -> Case:
+    """The same with x = diag(units) x'."""
+    problem, K, H = case
+    document, rows = problem.document(), units[:, None]
+    plant = problem.plant
+    document["plant"] |= {"A": (plant.A * units / rows).tolist(), "B": (plant.B / rows).tolist()}
+    document["plant"] |= {"M": (plant.M * units).tolist()}
+    for node, part in zip(document["node"], problem.nodes, strict=True):
+        node["C"] = (part.C * units).tolist()
+
+    def each(gains: LinkMatrices, columns: Array | float) -> LinkMatrices:
+        return {
+            mode: {i: {j: G * columns / rows for j, G in heard.items()} for i, heard in of_mode.items()}
+            for mode, of_mode in gains.items()
+        }
+
+    return Problem.from_document(document), each(K, units), each(H, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("radius", "stable"), [(0.5, True), (0.99999, True), (1.0 - 1e-8, True), (1.0 + 1e-8, False), (1.5, False)]
+)
+@pytest.mark.parametrize("makes", [FLOATS + BALLS, BALLS], ids=["floats first", "balls"])
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 2.0**40])
+def test_stable_or_not_is_proved(radius: float, stable: bool, makes: tuple[type, ...], unit: float) -> None:
+    case = in_units(scalar(radius), np.array([unit]))
+    assert Prover(*case, makes=makes).stable.holds is stable
+
+
+def test_on_the_border_nothing_is_said() -> None:
+    """An integrator that nobody corrects: its error neither dies out nor grows."""
+    assert Prover(*scalar(1.0)).stable.holds is None
+    assert "not known" in analyse(scalar(1.0)[0], GivenGains(*scalar(1.0)[1:], "by hand", None)).text()
+
+
+def test_a_transient_is_not_growth() -> None:
+    """Twelve nodes in a line, each of which hands on more than it got: E|error|^2 grows a millionfold, and dies out."""
+    problem, K, H = chain([0.5] + 12 * [-0.7])
+    model = error_model(problem, *stacked_links(problem, K, H))
+    gain = exact_gain(model)
+    assert gain.stable
+    assert gain.radius == pytest.approx(0.49, rel=1e-6)
+    assert Prover(problem, K, H).stable.holds is True
+
+
+def operator_of(case: Case) -> Operator:
+    problem, K, H = case
+    return Operator(error_model(problem, *stacked_links(problem, K, H)))
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_the_radius_is_that_of_the_eigenvalues(large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By Arnoldi's method too, and in whatever units."""
+    if large:
+        monkeypatch.setattr(module, "_FEW", 0)
+    case = chain([0.9, 0.3, -0.5, 0.7, 0.2])
+    operator = operator_of(case)
+    expected = float(np.abs(np.linalg.eigvals(module._matrix(operator.corner, 1, 5))).max())
+    assert spectral_radius(operator.corner, 1, 5) == pytest.approx(expected, rel=1e-9)
+    assert expected == pytest.approx(0.81, rel=1e-9)
+
+
+@pytest.mark.parametrize("radius", [0.9, 0.9999, 1.001])
+def test_large_networks_are_solved_without_a_matrix(radius: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_DENSE", 0)
+    monkeypatch.setattr(module, "_TERMS", 5)
+    operator = operator_of(chain([radius, 0.3, -0.5, 0.7]))
+    found = decay(operator.corner, 1, np.ones(4))
+    assert found.total is not None
+    assert found.rest is not None
+    assert np.allclose(found.rest, found.total - operator.corner(found.total))
+    assert np.linalg.eigvalsh(found.rest).min() > 0.0
+    assert found.dies_out is (radius < 1.0)
+
+
+# mutants of what is proved
+@pytest.mark.parametrize("make", [ByFloats, lambda *case: ByBalls(*case, bits=128)], ids=["floats", "balls"])
+def test_no_other_Z_proves_anything(make: type) -> None:
+    """The Z of stable errors with its sign changed, that of unstable ones raised to a positive one."""
+    by = make(*scalar(0.99))
+    Z = ByFloats(*scalar(0.99)).model.decay.total
+    assert Z is not None
+    assert all(sign.proved for sign in by.decreasing(Z))
+    assert all(sign.refuted for sign in by.decreasing(-Z))
+    by = make(*scalar(1.01))
+    Z = ByFloats(*scalar(1.01)).model.decay.total
+    assert Z is not None
+    assert all(sign.proved for sign in by.decreasing(Z))
+    assert all(sign.refuted for sign in by.positive(Z))
+    assert all(sign.refuted for sign in by.decreasing(np.abs(Z)))
+
+
+def test_a_wrong_sum_makes_nothing_stable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever finds Z is not believed: what is found for other errors proves nothing of these."""
+    right = ByFloats(*scalar(0.99)).model.decay
+    monkeypatch.setattr("designer.proof.float_model.decay", lambda *given: right)
+    assert Prover(*scalar(1.01)).stable.holds is None
