@@ -5,5 +5,6 @@ the rooms       contract: what both packages share, files, keys and messages; ne
 a node's step   inbox: what must be there before it; filter: eqs. (4) and (5); estimates: what is told of it
 the clock       pacing: a run against it, as data; faults: what such a run is to survive
 a whole run     plan: what the coordinator decides; receipts: what the recorder has; launch: every role on this machine
+                nursery: the process that they are forked from; children: how it is spoken to
 the machine     cli: the program; signals: what asks it to end
 """

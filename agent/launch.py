@@ -1,24 +1,21 @@
 """Starts every role as a process of its own on this machine, forwards signals, collects exits.
 
-A child reads the coordinator's address from its standard input, a pipe that the launcher holds open: its end
-tells the child that the launcher is gone. Children have sessions of their own, so Ctrl-C reaches the launcher
-alone, which has the coordinator end the run in order. Started with SIGINT ignored, it leaves that so, and its
-children inherit it; SIGTERM ends the run all the same.
+A child's standard input is a pipe that the launcher holds open: its end tells the child that the launcher is gone.
+Children have sessions of their own, so Ctrl-C reaches the launcher alone, which has the coordinator end the run in
+order. Started with SIGINT ignored, it leaves that so, and its children inherit it; SIGTERM ends the run all the same.
 """
 
 from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, NamedTuple
+from typing import Any
 
+from agent.children import LARGEST, Child, Nursery
 from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
@@ -29,19 +26,6 @@ from agent.signals import heed, restore
 RECORDER_SECONDS = 60.0  # after the coordinator has gone, the recorder has so long to close before it is killed
 MOST_REVIVALS, REVIVAL_SECONDS = 3, 10.0  # a role of a paced run is started again so often in so many seconds
 FAREWELL_SECONDS = 1.0  # after the recorder has gone, the others have so long
-
-
-class Child(NamedTuple):
-    """A role's process; what it says on stderr goes to a file, to be shown where it matters."""
-
-    process: subprocess.Popen[bytes]
-    said: IO[bytes]
-
-    def last_words(self) -> str:
-        """The last line of its stderr."""
-        self.said.seek(0)
-        lines = self.said.read().decode(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("peakmesh: ") if lines else ""
 
 
 def launch(
@@ -64,7 +48,7 @@ def launch(
     began = time.time()
     common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
-    commands |= {node_who(name): ["node", *common, "--node", name] for name in gains.problem.node_names}
+    commands |= {node_who(name): ["node", "--node", name, *common] for name in gains.problem.node_names}
     if not plan.needs_no_plant(gains.problem):
         commands[PLANT] = ["plant", *common]
     options = _recorder_options(recording_plan or RecordingPlan(), force=force)
@@ -75,7 +59,7 @@ def launch(
         summary: dict[str, Any] = {}
         for word in crew.words_of_coordinator():
             if "listening" in word:
-                crew.tell_address(word["listening"][0])
+                crew.keep_address(word["listening"][0])
             elif "started" in word:
                 crew.started = True
                 summary.setdefault("start_seconds", word["started"] - began)
@@ -129,49 +113,44 @@ class _Crew:
         self._children: dict[str, Child] = {}
         self._signal: int | None = None
         self._failed: str | None = None  # who ended badly before the run had started
-        self._before = heed(self._on_signal) | {signal.SIGCHLD: signal.signal(signal.SIGCHLD, self._on_exit)}
+        self._nursery = Nursery()
+        self._before = heed(self._on_signal)
 
     def start(self, who: str, command: list[str]) -> None:
         self._commands[who] = command
-        said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the crew
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "agent", *command],  # -P: no agent.py of the current folder
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE if who == COORDINATOR else subprocess.DEVNULL,
-            stderr=said,
-            start_new_session=True,
-        )
-        self._children[who] = Child(process, said)
+        arguments = [*command, "--sockets", str(self._nursery.folder)]
+        self._children[who] = self._nursery.start(arguments, wants_output=who == COORDINATOR)
         if self._signal is not None:  # it came before there was anybody to pass it on to
             self._end_run(self._signal)
 
     def words_of_coordinator(self) -> Iterator[dict[str, Any]]:
         """The lines of the coordinator's stdout, until it ends for good."""
         while True:
-            process = self._children[COORDINATOR].process
-            assert process.stdout is not None
-            for line in process.stdout:
-                yield json.loads(line)
-            if process.wait() >= 0 or not self._revive(COORDINATOR):  # it ends by itself where the run is over
+            coordinator = self._children[COORDINATOR]
+            yield from map(json.loads, self._lines_of(coordinator))
+            self._nursery.wait(coordinator)
+            assert coordinator.code is not None
+            if coordinator.code >= 0 or not self._revive(COORDINATOR):  # it ends by itself where the run is over
                 return
 
-    def tell_address(self, address: str) -> None:
-        """Tell everybody who does not know it yet where the coordinator listens."""
-        if self._address:
-            return
-        self._address = address
-        self._commands[COORDINATOR] += ["--listen", address]
-        for who, child in self._children.items():
-            if who != COORDINATOR:
-                self._tell(child)
+    def _lines_of(self, child: Child) -> Iterator[bytes]:
+        """What it says, heeding meanwhile who ends."""
+        assert child.output is not None
+        rest = b""
+        while True:
+            self._heed_exits()
+            if not self._nursery.watch(child.output):
+                continue
+            if not (said := child.output.read(LARGEST)):
+                return
+            *lines, rest = (rest + said).split(b"\n")
+            yield from lines
 
-    def _tell(self, child: Child) -> None:
-        assert child.process.stdin is not None
-        try:
-            child.process.stdin.write(f"{self._address}\n".encode())
-            child.process.stdin.flush()
-        except BrokenPipeError:  # it has ended already; _on_exit sees to that
-            return
+    def keep_address(self, address: str) -> None:
+        """Where a coordinator that comes back is to listen: at the address at which others know it."""
+        if not self._address:
+            self._address = address
+            self._commands[COORDINATOR] += ["--listen", address]
 
     def _revive(self, who: str) -> bool:
         """Start somebody again who has ended; False where that is not to be, or has been tried too often."""
@@ -181,24 +160,27 @@ class _Crew:
         if len(times) > MOST_REVIVALS and times[0] - times[MOST_REVIVALS] < REVIVAL_SECONDS:
             return False
         self._revived[who] = times
-        self._let_go(self._children[who])
+        self._children[who].close()
         self.start(who, self._commands[who])
-        if who != COORDINATOR:
-            self._tell(self._children[who])
         return True
 
     def wait(self) -> None:
         """Until all have ended, the recorder first; who lingers is killed, at once where nothing was recorded yet."""
         if self.started:
-            _wait_or_kill(self._children[RECORDER].process, RECORDER_SECONDS)
+            self._wait_or_kill(self._children[RECORDER], RECORDER_SECONDS)
         deadline = time.monotonic() + (FAREWELL_SECONDS if self.started else 0.0)
         for child in self._children.values():
-            _wait_or_kill(child.process, deadline - time.monotonic())
+            self._wait_or_kill(child, deadline - time.monotonic())
+
+    def _wait_or_kill(self, child: Child, seconds: float) -> None:
+        if not self._nursery.wait(child, seconds):
+            self._nursery.kill(child)
+            self._nursery.wait(child)
 
     def raise_what_happened(self, *, finished: bool) -> None:
         """`finished`: the coordinator has given its summary."""
         coordinator = self._children[COORDINATOR]
-        code = coordinator.process.returncode
+        code = coordinator.code
         if self._signal is not None:
             raise Interrupted(self._signal)
         if self._failed is not None:
@@ -208,8 +190,8 @@ class _Crew:
             self._raise(coordinator, "the coordinator ended without a word")
 
     def _raise(self, child: Child, otherwise: str) -> None:
-        code, words = child.process.returncode, child.last_words()
-        if code < 0:
+        code, words = child.code, child.last_words()
+        if code is not None and code < 0:
             raise RunBroken(f"{otherwise}: killed by {signal.Signals(-code).name}")
         raise (InputError if code == EXIT_INPUT else RunBroken)(f"{words or otherwise}{self._cause(words)}")
 
@@ -217,64 +199,39 @@ class _Crew:
         """The last words of the child that the coordinator's `words` call lost."""
         for who, child in self._children.items():
             own = child.last_words()
-            if who != COORDINATOR and in_words(who) in words and child.process.returncode and own:
+            if who != COORDINATOR and in_words(who) in words and child.code and own:
                 return f"; it said: {own}"
         return ""
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self._signal is not None:  # asked twice: at once
             for child in self._children.values():
-                child.process.kill()
+                self._nursery.kill(child)
         self._signal = self._signal or number
         self._end_run(number)
 
-    def _on_exit(self, number: int, frame: FrameType | None) -> None:
-        coordinator = self._children.get(COORDINATOR)
+    def _heed_exits(self) -> None:
+        """Start again who has ended, where that is to be; before the start, whoever fails ends the run."""
+        ended = [who for who, child in self._children.items() if who != COORDINATOR and child.code is not None]
         if self.started and self.survives:
-            for who, child in list(self._children.items()):
-                if who != COORDINATOR and child.process.poll() is not None:
-                    self._revive(who)
-            return
-        if self.started or self._failed is not None or coordinator is None or coordinator.process.poll() is not None:
-            return
-        for who, child in self._children.items():
-            if who != COORDINATOR and child.process.poll() not in (None, 0):
-                self._failed = who
+            for who in ended:
+                self._revive(who)
+        elif not self.started and self._failed is None and self._children[COORDINATOR].code is None:
+            self._failed = next((who for who in ended if self._children[who].code), None)
+            if self._failed is not None:
                 self._end_run(signal.SIGTERM)
-                return
 
     def _end_run(self, number: int) -> None:
         if COORDINATOR in self._children:
-            self._children[COORDINATOR].process.send_signal(number)
-
-    @staticmethod
-    def _let_go(child: Child) -> None:
-        child.process.wait()
-        for stream in (child.process.stdin, child.process.stdout, child.said):
-            if stream is not None:
-                _close(stream)
+            self._nursery.kill(self._children[COORDINATOR], number)
 
     def __enter__(self) -> _Crew:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for child in self._children.values():
-            if child.process.poll() is None:
-                child.process.kill()
-            self._let_go(child)
-        restore(self._before)
-
-
-def _wait_or_kill(process: subprocess.Popen[bytes], seconds: float) -> None:
-    try:
-        process.wait(max(0.0, seconds))
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
-def _close(stream: IO[bytes]) -> None:
-    try:
-        stream.close()
-    except BrokenPipeError:
-        return
+        try:
+            self._nursery.close()
+        finally:
+            for child in self._children.values():
+                child.close()
+            restore(self._before)

@@ -128,21 +128,26 @@ class Watcher(threading.Thread):
         return found
 
     def _children(self) -> list[int]:
-        try:
-            text = Path(f"/proc/{self._launcher}/task/{self._launcher}/children").read_text()
-        except OSError:
-            return []
-        return [int(pid) for pid in text.split()]
+        return [role for nursery in children(self._launcher) for role in children(nursery)]
+
+
+def children(parent: int) -> list[int]:
+    try:
+        text = Path(f"/proc/{parent}/task/{parent}/children").read_text()
+    except OSError:
+        return []
+    return [int(pid) for pid in text.split()]
 
 
 def role(pid: int) -> str:
     """`node 3`, `plant`, ... from a command line."""
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+        words = Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ").split()
     except OSError:
         return ""
-    name = words[words.index("--node") + 1] if "--node" in words else ""
-    return f"{words[words.index('agent') + 1]} {name}".strip() if "agent" in words else ""
+    if words[:1] != ["peakmesh"]:
+        return ""
+    return f"node {words[words.index('--node') + 1]}" if words[1] == "node" else words[1]
 
 
 def counted(pid: int) -> list[float]:

@@ -31,10 +31,12 @@ ROOMS = {
     "agent.network": "agent.plan agent.signals",
     "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.inbox agent.network "
     "agent.pacing agent.plan agent.receipts agent.signals",
-    "agent.launch": "agent.contract.recording agent.plan agent.signals",
+    "agent.children": "",
+    "agent.launch": "agent.children agent.contract.recording agent.plan agent.signals",
     "agent.commands": "agent.contract.recording agent.faults agent.launch agent.network agent.plan agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
+    "agent.nursery": "agent.children agent.cli agent.network agent.roles",
     # the mathematics
     "designer.decay": "",
     "designer.model": "",
@@ -91,6 +93,7 @@ DOORS = {
     "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/"],
+    "setproctitle": ["agent/nursery.py"],
     "rich": ["agent/commands/words.py", "designer/commands/", "designer/watch/table.py"],
     "distributed": ["designer/workers.py"],
 }

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,7 @@ def add_network_options(
     )
     parser.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--sockets", type=Path, help=argparse.SUPPRESS)  # of a run on one machine, a folder
 
 
 def node_command(options: argparse.Namespace) -> int:
@@ -111,7 +113,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
     gains = load_gains(options.gains)
     plan = plan_of(options, gains)
     say = say_to_launcher if options.child else say_to_person
-    with Bus(network_of(options), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
+    with Bus(_place(options, gains, COORDINATOR), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
         say({"listening": bus.locators()})
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
@@ -128,7 +130,7 @@ def recorder_command(options: argparse.Namespace) -> int:
     gains = load_gains(options.gains)
     run = options.run or gains.problem.name
     path = options.output or default_recording(run)
-    with Bus(network_of(options), run=run, who=RECORDER) as bus:
+    with Bus(_place(options, gains, RECORDER), run=run, who=RECORDER) as bus:
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
     print(f"recording  {parts.in_words(parts.files_of(path))}")
     return EXIT_GOOD
@@ -155,11 +157,23 @@ def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callab
     from agent.network.bus import Bus
 
     run = options.run or gains.problem.name
-    with Bus(network_of(options), run=run, who=who) as bus:
+    with Bus(_place(options, gains, who), run=run, who=who) as bus:
         if not options.child:
             print(f'{in_words(who)} waits for everybody of run "{run}"', file=sys.stderr)
         role(bus)
     return EXIT_GOOD
+
+
+def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
+    """Where a participant is; in a run on one machine only the coordinator can be reached by an address, too."""
+    from agent.contract.keys import COORDINATOR
+    from agent.network.links import sockets
+
+    network = network_of(options)
+    if options.sockets is None:
+        return network
+    listen = network.listen if who == COORDINATOR else ""
+    return replace(network, listen=listen, sockets=sockets(gains.problem, who, options.sockets))
 
 
 def network_of(options: argparse.Namespace) -> Network:
@@ -168,7 +182,7 @@ def network_of(options: argparse.Namespace) -> Network:
 
     connect = tuple(options.connect)
     if options.child:
-        if options.command != "coordinator":
+        if options.command != "coordinator" and options.sockets is None:
             connect = (sys.stdin.readline().strip(),)
             if connect == ("",):
                 raise RunBroken("the launcher ended before the run had started")

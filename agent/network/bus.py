@@ -2,9 +2,14 @@
 
 What roles talk to. What makes it lose nothing:
 
-* the start barrier: everybody declares what it receives, then a liveliness token, then waits for all tokens.
-  Every two peers have a link of their own, and declarations keep their order on a link, so whoever sees a token
-  knows that peer's subscriptions;
+* the start barrier: everybody declares what it receives, then a liveliness token, then waits for the tokens of all
+  with whom it exchanges messages (`links.linked`: as A waits for B, so does B for A), and tells the coordinator, which
+  orders the start when all have told. Every two of those have a link of their own, a token is seen over that link
+  alone, for peers pass on neither declarations nor messages, and declarations keep their order on a link: so whoever
+  sees a token knows that peer's subscriptions. At the start, then, every publisher knows every subscription to what
+  it publishes, though most pairs of nodes know nothing of each other;
+* somebody who is lost is seen by those who have a link with it. The coordinator, plant and recorder have one with
+  everybody, and the coordinator alone decides what follows, so nobody need see all the others;
 * every data message is numbered and kept until the recorder has acknowledged it (`outbox`), and the recorder can
   ask for it again;
 * when a run ends, nobody who is well leaves before the recorder has closed the recording.
@@ -96,8 +101,9 @@ class Bus:
             restore(self._handlers)
 
     def locators(self) -> list[str]:
-        """The addresses at which others can connect."""
-        return self._session.locators()
+        """The addresses at which others can connect, but for the socket that those of a run on one machine know."""
+        sockets = self.network.sockets
+        return [address for address in self._session.locators() if sockets is None or address != sockets.listen]
 
     @property
     def present(self) -> Set[str]:

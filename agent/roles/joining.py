@@ -7,14 +7,15 @@ from collections.abc import Callable
 
 from agent.contract.errors import InputError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import PLANT, RECORDER, in_words, participants
+from agent.contract.keys import PLANT, RECORDER, in_words
 from agent.contract.messages import Control
 from agent.network.bus import Bus
+from agent.network.links import linked
 from agent.network.words import ChannelClosed, RunClosed, UnderWay
 
 
 def join(bus: Bus, gains: Gains) -> Control:
-    """Enter, meet everybody, say so, and wait for the start. Topics must be declared before.
+    """Enter, meet whom we deal with, say so, and wait for the start. Topics must be declared before.
 
     A paced run that has begun without us is joined where it is. InputError where it is one of other gains.
     """
@@ -33,7 +34,7 @@ def join(bus: Bus, gains: Gains) -> Control:
 def _met(bus: Bus, gains: Gains) -> Control:
     """The order to start."""
     try:
-        for _ in bus.meet(who for who in participants(gains.problem) if who != PLANT):
+        for _ in bus.meet(linked(gains.problem, bus.who) - {PLANT}):
             pass  # the plant meets us; whether there is one, the coordinator knows
         bus.report_ready(gains.digest())
         start = bus.wait_for_start()

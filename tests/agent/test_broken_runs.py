@@ -140,17 +140,23 @@ def test_killed_coordinator_ends_the_run(lone_path: Path, tmp_path: Path) -> Non
 
 
 def test_killed_launcher_leaves_no_process(lone_path: Path, tmp_path: Path) -> None:
-    """Kill -9 of the launcher: its children notice, the recording is closed, nobody stays."""
+    """Kill -9 of the launcher: its children notice, the recording is closed, nobody stays, nor their sockets."""
     recording = tmp_path / "run.mcap"
     with started("run", lone_path, "--steps", MANY, "-o", recording) as launcher:
         while not recording.with_name("run.mcap.part").exists():  # the recorder opens it when the run starts
             assert launcher.poll() is None
             time.sleep(0.01)
-        crew = list(children(launcher.pid))
+        crew = children(launcher.pid)
         assert len(crew) == 4
+        (sockets,) = {Path(command[command.index("--sockets") + 1]) for command in crew.values()}
+        assert sockets.is_dir()
         launcher.kill()
-        wait_until_gone(crew)
+        wait_until_gone(list(crew))
     assert end_of(recording) is not None
+    deadline = time.monotonic() + PATIENCE
+    while sockets.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_frozen_node_is_named_after_the_deadline(pair_path: Path, tmp_path: Path, pair: Gains) -> None:

@@ -23,6 +23,7 @@ from agent.launch import launch
 from agent.plan import Plan
 
 MANY = 100_000  # steps of a run that a test ends itself
+NURSERY = "agent.nursery"
 PATIENCE = 300.0  # seconds after which a wait of a test has failed, on a busy machine too
 
 
@@ -67,13 +68,20 @@ def child(parent: int, *words: str) -> int:
 
 
 def children(parent: int) -> dict[int, list[str]]:
-    """Process ids and command lines of the children of `parent`."""
+    """Process ids and command lines of the children of `parent`; instead of a nursery, those that it has forked."""
+    found = {}
+    for pid, command in _children(parent).items():
+        found |= _children(pid) if NURSERY in command else {pid: command}
+    return found
+
+
+def _children(parent: int) -> dict[int, list[str]]:
     found = {}
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError, IndexError):
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
             if int(fields[1]) == parent:
-                found[int(entry.name)] = (entry / "cmdline").read_text().split("\0")
+                found[int(entry.name)] = (entry / "cmdline").read_text().replace("\0", " ").split()
     return found
 
 
@@ -173,8 +181,9 @@ def run_here(
 
 
 def roles_left() -> dict[int, list[str]]:
-    """The children of this process that play a role of a run."""
-    return {pid: command for pid, command in children(os.getpid()).items() if "agent" in command}
+    """The children of this process that play a role of a run, and what they are forked from."""
+    own = _children(os.getpid()) | children(os.getpid())
+    return {pid: command for pid, command in own.items() if NURSERY in command or "--child" in command}
 
 
 def kill(*words: str) -> Callable[[], None]:
