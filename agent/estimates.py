@@ -10,6 +10,7 @@ from agent.contract.errors import RunBroken
 from agent.contract.gains import NodeGains
 from agent.contract.messages import Estimate
 from agent.filter import Pair
+from agent.product import product
 
 
 def told(
@@ -28,7 +29,7 @@ def told(
             step=k,
             x_hat=pair.x_hat.tolist(),
             innovation=pair.innovation.tolist(),
-            z_hat=(own.M @ pair.x_hat).tolist(),
+            z_hat=product(own.M, pair.x_hat).tolist(),
             mode=mode,
             heard=list(heard),
             measured=measured,

@@ -12,6 +12,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.gains import NodeGains
+from agent.product import product
 
 
 class Pair(NamedTuple):
@@ -28,8 +29,8 @@ def innovation(gains: NodeGains, y: Array, x_hat: Array) -> Array:
     nothing arrived, which is an empty `y`.
     """
     if not gains.seen:
-        return y - gains.arrival_probability * (gains.C @ x_hat)
-    return y - gains.C @ x_hat if len(y) else np.zeros(len(gains.C))
+        return y - gains.arrival_probability * product(gains.C, x_hat)
+    return y - product(gains.C, x_hat) if len(y) else np.zeros(len(gains.C))
 
 
 def step(gains: NodeGains, mode: str, heard: Mapping[str, Pair]) -> Array:
@@ -37,24 +38,15 @@ def step(gains: NodeGains, mode: str, heard: Mapping[str, Pair]) -> Array:
 
     `heard` holds the pairs that arrived, the node's own among them. For a neighbour j in `mode` whose pair did not,
     x_hat_i(k) stands in for x_hat_j(k), and 0 for nu_j(k), so that the sum of the weights of estimates stays the same.
+    All links are one product, of which every row is summed from left to right.
 
     Unbiased gains, sum over j of a_ij K_ij = A: the step is the same, with a_ii K_ii taken from that equation,
     x_hat_i(k+1) = A x_hat_i(k) + sum over j heard of a_ij (K_ij (x_hat_j(k) - x_hat_i(k)) + H_ij nu_j(k)). So an
     unstable plant is followed exactly: the rounding of K_ii in a file is not multiplied by a state that grows.
     """
     x_hat_i = heard[gains.node].x_hat
-    if gains.A is not None:
-        x_hat_next = gains.A @ x_hat_i
-        for j, a_ij, K_ij, H_ij in gains.links[mode]:
-            if j in heard:
-                x_hat_j, nu_j = heard[j]
-                x_hat_next += a_ij * (K_ij @ (x_hat_j - x_hat_i) + H_ij @ nu_j)
-        return x_hat_next
-    x_hat_next = np.zeros(gains.M.shape[1])
-    for j, a_ij, K_ij, H_ij in gains.links[mode]:
-        if j in heard:
-            x_hat_j, nu_j = heard[j]
-            x_hat_next += a_ij * (K_ij @ x_hat_j + H_ij @ nu_j)
-        else:
-            x_hat_next += a_ij * (K_ij @ x_hat_i)
-    return x_hat_next
+    told = [] if gains.A is None else [x_hat_i]
+    for link in gains.links[mode]:
+        x_hat_j, nu_j = heard.get(link.sender) or (x_hat_i, np.zeros(link.H.shape[1]))
+        told += [x_hat_j if gains.A is None else x_hat_j - x_hat_i, nu_j]
+    return product(gains.rows[mode], np.concatenate(told))

@@ -22,15 +22,16 @@ ROOMS = {
     "agent.contract.recording": "",
     "agent.plan": "",
     "agent.faults": "",
-    "agent.filter": "",
+    "agent.product": "",
+    "agent.filter": "agent.product",
     "agent.inbox": "agent.filter",
-    "agent.estimates": "agent.filter",
+    "agent.estimates": "agent.filter agent.product",
     "agent.pacing": "agent.estimates agent.filter agent.inbox agent.plan",
     "agent.receipts": "",
     "agent.signals": "",
     "agent.network": "agent.plan agent.signals",
     "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.inbox agent.network "
-    "agent.pacing agent.plan agent.receipts agent.signals",
+    "agent.pacing agent.plan agent.product agent.receipts agent.signals",
     "agent.children": "",
     "agent.launch": "agent.children agent.contract.recording agent.plan agent.signals",
     "agent.commands": "agent.contract.recording agent.faults agent.launch agent.network agent.plan agent.roles",
@@ -105,6 +106,7 @@ PURE = [
     "agent/filter.py",
     "agent/inbox.py",
     "agent/pacing/",
+    "agent/product.py",
     "agent/receipts.py",
 ]
 IMPURE = [

@@ -136,7 +136,11 @@ class Gains(Model):
         }
         node = problem.nodes[i]
         A = problem.plant.A if problem.unbiased else None
-        return NodeGains(name, node.C, node.arrival_probability, problem.plant.M, links, node.seen, A)
+        rows = {
+            mode: np.hstack([*([] if A is None else [A]), *(block for _, a, K, H in heard for block in (a * K, a * H))])
+            for mode, heard in links.items()
+        }
+        return NodeGains(name, node.C, node.arrival_probability, problem.plant.M, links, rows, node.seen, A)
 
     @model_validator(mode="after")
     def _check_digest(self) -> Self:
@@ -219,6 +223,9 @@ class NodeGains(NamedTuple):
     arrival_probability: float  # beta_i
     M: Array  # (nz, nx)
     links: dict[str, tuple[Link, ...]]  # mode -> what the node hears in it, itself among them
+    rows: dict[
+        str, Array
+    ]  # mode -> eq. (5) as one matrix: [a_ij K_ij, a_ij H_ij] of the links, in their order, after A
     seen: bool = False  # whether it knows which of its measurements are lost
     A: Array | None = None  # of the plant, where the gains are unbiased: a_ii K_ii is A less what others get
 

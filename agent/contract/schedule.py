@@ -2,18 +2,18 @@
 
 Every draw is a function of (seed, stream, step) alone: numpy's Philox generator with key (seed, stream) and a
 counter that starts at a multiple of the step. So a live run, a simulation and a replay see the same draws
-whatever their order, and a restarted coordinator goes on with the same chain.
+whatever their order, a restarted coordinator goes on with the same chain, and every machine draws the same bits.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
+from agent.contract.elementary import cos_of_turns, exp, log, sin
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
@@ -107,7 +107,7 @@ class DisturbanceSource:
             case Quiet():
                 return np.zeros(self._nw)
             case DampedSine(amplitude=amplitude, decay=decay, frequency=frequency):
-                return np.full(self._nw, amplitude * math.exp(-decay * step) * math.sin(frequency * step))
+                return np.full(self._nw, amplitude * exp(-decay * step) * sin(frequency * step))
             case Impulse(amplitude=amplitude, at=at):
                 return np.full(self._nw, amplitude if step == at else 0.0)
             case Samples(values=values):
@@ -122,5 +122,5 @@ class DisturbanceSource:
 def normal(uniform: Array) -> Array:
     """Standard normal draws from twice as many uniform ones, by Box and Muller; (..., 2 m) -> (..., m)."""
     half = uniform.shape[-1] // 2
-    radius = np.sqrt(-2.0 * np.log1p(-uniform[..., :half]))
-    return np.asarray(radius * np.cos(2.0 * np.pi * uniform[..., half:]))
+    radius = np.sqrt(-2.0 * log(1.0 - uniform[..., :half]))  # 1 - u is exact
+    return np.asarray(radius * cos_of_turns(uniform[..., half:]))

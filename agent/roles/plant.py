@@ -15,6 +15,7 @@ from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.faults import Ordeal, parse
 from agent.network.bus import Bus
+from agent.product import product
 from agent.roles.joining import take_part
 from agent.roles.suffering import suffer
 
@@ -76,7 +77,7 @@ class SimulatedPlant:
         state = PlantState(
             step=step,
             x=x.tolist(),
-            z=(plant.M @ x).tolist(),
+            z=product(plant.M, x).tolist(),
             w=w.tolist(),
             arrived=[int(arrived) for arrived in theta],
         )
@@ -84,7 +85,7 @@ class SimulatedPlant:
             node.name: Measurement(step=step, y=_measured(node, theta_i, x, w).tolist())
             for node, theta_i in zip(self._problem.nodes, theta, strict=True)
         }
-        self._x = plant.A @ x + plant.B @ w
+        self._x = product(plant.A, x) + product(plant.B, w)
         self._step += 1
         return state, measurements
 
@@ -93,4 +94,4 @@ def _measured(node: Node, theta_i: float, x: Array, w: Array) -> Array:
     """Eq. (2): theta_i C_i x + D_i w, (ny_i,); empty where a node that sees its losses loses this one."""
     if node.seen and not theta_i:
         return np.empty(0)
-    return theta_i * (node.C @ x) + node.D @ w
+    return theta_i * product(node.C, x) + product(node.D, w)
