@@ -46,7 +46,7 @@ def launch(
     on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
     began = time.time()
-    common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
+    common = [str(gains_path), "--run", run, "--wait", str(wait), "--deadline", str(plan.deadline), "--child"]
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
     commands |= {node_who(name): ["node", "--node", name, *common] for name in gains.problem.node_names}
     if not plan.needs_no_plant(gains.problem):
@@ -82,7 +82,7 @@ def launch(
 
 
 def _plan_options(plan: Plan) -> list[str]:
-    options = ["--steps", plan.steps, "--seed", plan.seed, "--window", plan.window, "--deadline", plan.deadline]
+    options = ["--steps", plan.steps, "--seed", plan.seed, "--window", plan.window]
     for node in plan.external:
         options += ["--external", node]
     if plan.pace is not None:
@@ -199,7 +199,7 @@ class _Crew:
         """The last words of the child that the coordinator's `words` call lost."""
         for who, child in self._children.items():
             own = child.last_words()
-            if who != COORDINATOR and in_words(who) in words and child.code and own:
+            if who != COORDINATOR and in_words(who) in words and child.code and own and own not in words:
                 return f"; it said: {own}"
         return ""
 

@@ -1,7 +1,8 @@
-"""Which signals ask a program to end: SIGTERM always, SIGINT unless it was started with SIGINT ignored.
+"""Which signals ask a program to end: SIGTERM always, SIGINT and SIGHUP unless it was started with them ignored.
 
-That is how a shell starts what a script puts in the background (`peakmesh run ... &`), so that Ctrl-C reaches only
-what stands in the foreground; nohup does the same for SIGHUP. Whoever wants such a program to end sends SIGTERM.
+A shell starts with SIGINT ignored what a script puts in the background (`peakmesh run ... &`), so that Ctrl-C reaches
+only what stands in the foreground; nohup does the same for SIGHUP, which comes where a terminal is closed. Whoever
+wants such a program to end sends SIGTERM.
 Processes that it starts inherit what is ignored.
 """
 
@@ -19,8 +20,7 @@ Handlers = dict[int, Any]  # of signals; what signal.signal returns
 def heed(handler: Handler) -> Handlers:
     """Have `handler` called when this program is asked to end; returns what was there before, for `restore`."""
     asked = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        asked.append(signal.SIGINT)
+    asked += [number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) is not signal.SIG_IGN]
     return {number: signal.signal(number, handler) for number in asked}
 
 

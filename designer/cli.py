@@ -33,10 +33,11 @@ from designer.commands import (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code (agent/contract/errors.py)."""
+    agent.cli.open_streams()
     parser = argparse.ArgumentParser(
         prog="peakmesh",
         description="Design, run and audit distributed peak-error filters.",
-        epilog="Exit codes: 0 good; 1 the answer is no; 2 bad input; 3 the run broke; 130, 143 stopped by a signal.",
+        epilog="Exit codes: 0 good; 1 the answer is no; 2 bad input; 3 the run broke; 129, 130 or 143 by a signal.",
     )
     parser.add_argument("--version", action="version", version=f"peakmesh {version('peakmesh')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")

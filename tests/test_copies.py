@@ -118,6 +118,10 @@ def examples() -> dict[type, Frozen]:
             to_step_max=0.003,
         ),
         messages.BrokenOff(reason="the disk is full", steps=3, stop=True),
+        messages.Joining(
+            who="plant", session="a", version="0", listen="none", machine="", lease=1.0, lacks=["recorder"]
+        ),
+        messages.Leaving(who="plant", reason="b"),
         messages.Ready(who="node-1", session="a", gains="b"),
         messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
         messages.Facts(

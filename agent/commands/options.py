@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from agent.commands.variables import Repeated
 from agent.contract.errors import InputError
 from agent.plan import LARGEST_WINDOW, Pace, Plan, RecordingPlan
 
@@ -36,12 +37,10 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--window", type=_window, default=32, metavar="W", help="steps that the modes may run ahead (32); 1 is strict"
     )
-    parser.add_argument(
-        "--deadline", type=positive, default=10.0, metavar="S", help="seconds without progress that stop a run (10)"
-    )
+    add_deadline_option(parser, "seconds without progress that stop a run (10)")
     parser.add_argument(
         "--external",
-        action="append",
+        action=Repeated,
         default=[],
         metavar="NODE",
         help="the measurements of this node come from a sensor, not from the simulated plant; may be repeated",
@@ -51,7 +50,7 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--fault",
-        action="append",
+        action=Repeated,
         default=[],
         metavar="FAULT",
         help="that a paced run is to survive, such as kill:node=2,step=100, freeze:node=3,step=50,for=2s, "
@@ -63,6 +62,10 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--hear-by", type=_part, default=0.8, metavar="PART", help="of a period, to wait for what nodes hear (0.8)"
     )
+
+
+def add_deadline_option(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--deadline", type=positive, default=10.0, metavar="S", help=about)
 
 
 def add_output_options(parser: argparse.ArgumentParser, metavar: str, about: str) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from agent.commands.options import (
     RECORDING,
     Subcommands,
     add_command,
+    add_deadline_option,
     add_output_options,
     add_plan_options,
     add_recording_options,
@@ -28,19 +28,23 @@ from agent.commands.options import (
     recording_plan_of,
     run_name,
 )
+from agent.commands.supervisor import tell_supervisor
+from agent.commands.variables import Repeated, heed_variables
 from agent.commands.words import say_broken_off, say_to_launcher, say_to_person
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, InputError, RunBroken
+
+LEAST_LEASE = 10.0  # s; where a run may stand still for longer, links last twice as long: the deadline decides
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.network.configuration import Network
 
 
-def add_roles(commands: Subcommands) -> None:
-    """Add the commands that take one role each."""
+def add_roles(commands: Subcommands, environment: Mapping[str, str] = os.environ) -> None:
+    """Add the commands that take one role each; what their options are by default may stand in the environment."""
     node = _role(commands, "node", node_command, "take part as one sensor node")
     node.add_argument("--node", required=True, metavar="NAME", help="which node of the problem")
-    _role(commands, "plant", plant_command, "take part as the simulated plant")
+    plant = _role(commands, "plant", plant_command, "take part as the simulated plant")
     coordinator = _role(commands, "coordinator", coordinator_command, "start the run, give out the modes, end it")
     add_plan_options(coordinator)
     recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
@@ -51,6 +55,12 @@ def add_roles(commands: Subcommands) -> None:
     live.add_argument(
         "--port", type=port, default=8765, metavar="N", help="port for Foxglove (8765); 0 takes a free one"
     )
+    router = add_command(commands, "router", router_command, "pass on what those say who cannot reach one another")
+    router.add_argument(
+        "--listen", default="tcp/127.0.0.1:7447", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:7447)"
+    )
+    for role in (node, plant, coordinator, recorder, live, router):
+        heed_variables(role, environment)
 
 
 def _role(
@@ -59,6 +69,10 @@ def _role(
     parser = add_command(commands, name, call, about)
     parser.add_argument("gains", type=Path, metavar="GAINS", help="gains file, the same for everybody")
     add_network_options(parser)
+    if name != "coordinator":
+        add_deadline_option(
+            parser, "as the coordinator has it: after twice as many seconds of silence a link is lost (10)"
+        )
     return parser
 
 
@@ -71,14 +85,16 @@ def add_network_options(
         "--listen",
         default="tcp/127.0.0.1:0",
         metavar="ADDRESS",
-        help="where to be reached (tcp/127.0.0.1:0; port 0 takes a free one)",
+        help="where to be reached (tcp/127.0.0.1:0; port 0 takes a free one), or none: by nobody, everything goes "
+        "through the one that --connect names",
     )
     parser.add_argument(
         "--connect",
-        action="append",
+        action=Repeated,
         default=[],
         metavar="ADDRESS",
-        help="required: of the coordinator, for example tcp/127.0.0.1:7447",
+        help="required, but for the coordinator: its address, for example tcp/127.0.0.1:7447, or that of a router; or "
+        "multicast, for everybody, where it is to be found on the local network",
     )
     parser.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -114,7 +130,8 @@ def coordinator_command(options: argparse.Namespace) -> int:
     plan = plan_of(options, gains)
     say = say_to_launcher if options.child else say_to_person
     with Bus(_place(options, gains, COORDINATOR), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
-        say({"listening": bus.locators()})
+        say({"listening": bus.locators() or list(options.connect)})
+        _tell_supervisor(options, "the coordinator waits for everybody")
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
     return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
@@ -131,6 +148,7 @@ def recorder_command(options: argparse.Namespace) -> int:
     run = options.run or gains.problem.name
     path = options.output or default_recording(run)
     with Bus(_place(options, gains, RECORDER), run=run, who=RECORDER) as bus:
+        _tell_supervisor(options, "the recorder waits for everybody")
         recorder.run(bus, gains, path=path, force=options.force, plan=recording_plan_of(options), report=say_broken_off)
     print(f"recording  {parts.in_words(parts.files_of(path))}")
     return EXIT_GOOD
@@ -152,6 +170,30 @@ def live_command(options: argparse.Namespace) -> int:
     return EXIT_GOOD
 
 
+def router_command(options: argparse.Namespace) -> int:
+    """`peakmesh router`: takes no part in any run."""
+    from agent.network.addresses import NONE, refuse_addresses
+    from agent.network.configuration import Network
+    from agent.roles import router
+
+    refuse_addresses(listen=options.listen, connect=())
+    if options.listen == NONE:
+        raise InputError("--listen none: nobody could reach the router")
+
+    def say(addresses: list[str]) -> None:
+        print(f"listening at {', '.join(addresses)}", file=sys.stderr, flush=True)
+        tell_supervisor("the router passes on what it gets")
+
+    router.run(Network(options.listen, routes=True), say=say)
+    return EXIT_GOOD  # it has no other end than to be asked to
+
+
+def _tell_supervisor(options: argparse.Namespace, status: str) -> None:
+    """Whoever started a whole run hears nothing of its parts."""
+    if not options.child:
+        tell_supervisor(status)
+
+
 def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callable[[Any], None]) -> int:
     from agent.contract.keys import in_words
     from agent.network.bus import Bus
@@ -160,6 +202,7 @@ def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callab
     with Bus(_place(options, gains, who), run=run, who=who) as bus:
         if not options.child:
             print(f'{in_words(who)} waits for everybody of run "{run}"', file=sys.stderr)
+        _tell_supervisor(options, f"{in_words(who)} waits for everybody")
         role(bus)
     return EXIT_GOOD
 
@@ -178,6 +221,7 @@ def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
 
 def network_of(options: argparse.Namespace) -> Network:
     """What the options of `add_network_options` ask for."""
+    from agent.network.addresses import NONE, refuse_addresses
     from agent.network.configuration import Network
 
     connect = tuple(options.connect)
@@ -187,13 +231,11 @@ def network_of(options: argparse.Namespace) -> Network:
             if connect == ("",):
                 raise RunBroken("the launcher ended before the run had started")
         threading.Thread(target=_stop_with_launcher, daemon=True).start()
-    elif options.command != "coordinator" and not connect:
+    elif not connect and (options.command != "coordinator" or options.listen == NONE):
         raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
-    for option, addresses in (("--listen", (options.listen,)), ("--connect", connect)):
-        for address in addresses:
-            if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
-                raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
-    return Network(options.listen, connect, options.wait)
+    refuse_addresses(listen=options.listen, connect=connect)
+    deadline = options.deadline if "deadline" in options else 0.0  # a viewer's own patience is nobody's concern
+    return Network(options.listen, connect, options.wait, lease=max(LEAST_LEASE, 2.0 * deadline))
 
 
 def _stop_with_launcher() -> None:

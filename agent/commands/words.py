@@ -27,6 +27,8 @@ def say_to_person(word: dict[str, Any]) -> None:
             print("everybody is there: the run starts", file=sys.stderr)
         case {"broken_off": sentence}:
             say_broken_off(sentence)
+        case {"warning": sentence}:
+            say_warning(sentence)
         case {"summary": summary}:
             print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
             if summary["broken_off"]:
@@ -36,6 +38,11 @@ def say_to_person(word: dict[str, Any]) -> None:
 def say_broken_off(sentence: object) -> None:
     """That there is no recording any more, while the run may go on."""
     print(f"peakmesh: the recording broke off: {sentence}", file=sys.stderr, flush=True)
+
+
+def say_warning(sentence: object) -> None:
+    """What is not as it should be, though the run goes on."""
+    print(f"peakmesh: warning: {sentence}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -48,6 +55,8 @@ def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], No
     def warn(word: dict[str, Any]) -> None:
         if "broken_off" in word:
             say_broken_off(word["broken_off"])
+        if "warning" in word:
+            say_warning(word["warning"])
 
     if not sys.stderr.isatty():
         yield warn

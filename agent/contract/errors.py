@@ -5,7 +5,7 @@ PeakmeshError
 ├── Unattainable    1  the question was well put and the answer is no: infeasible, no certificate
 └── RunBroken       3  a run or a recording broke: a time-out, a lost peer, a cut log
     ├── RecordingFailed  the recording cannot be written any more
-    └── Interrupted 130 or 143: stopped by SIGINT or SIGTERM
+    └── Interrupted 130, 143 or 129: stopped by SIGINT, SIGTERM, or SIGHUP
 
 A message is one sentence that says what, where, the value, and what would be right.
 """
@@ -60,7 +60,7 @@ class Interrupted(RunBroken):
     """Stopped from outside by a signal."""
 
     def __init__(self, signal_number: int) -> None:
-        super().__init__("interrupted" if signal_number == 2 else "terminated")
+        super().__init__({1: "the terminal was closed", 2: "interrupted"}.get(signal_number, "terminated"))
         self.exit_code = 128 + signal_number
 
 

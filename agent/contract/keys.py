@@ -19,6 +19,8 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
 | session/<who>/<id>     | liveliness  | everyone but sensors       | <who>: is it there twice?                  |
 | refused/<who>/<id>     | a sentence  | everyone but sensors       | session <id> of <who>: its place is taken  |
+| joining/<who>          | Joining     | everyone but sensors       | coordinator: where it is, whom it lacks    |
+| leaving/<who>          | Leaving     | everyone but sensors       | coordinator: why it goes                   |
 | ready/<who>            | Ready       | everyone but sensors       | coordinator, recorder: it has seen others  |
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
@@ -139,6 +141,14 @@ def session(who: str, identity: str) -> str:
 
 def refused(who: str, identity: str) -> str:
     return f"refused/{who}/{identity}"
+
+
+def joining(who: str) -> str:
+    return f"joining/{who}"
+
+
+def leaving(who: str) -> str:
+    return f"leaving/{who}"
 
 
 def ready(who: str) -> str:

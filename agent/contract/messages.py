@@ -137,6 +137,29 @@ class Evidence(Message):
     head: str = Field(pattern=r"^[0-9a-f]{32}$")
 
 
+class Joining(Frozen):
+    """`who` is there, as the coordinator needs to know it before the run can start.
+
+    `listen` is where it was asked to listen, `machine` whose network it is on, "" where that cannot be said; `lacks`
+    are those whom it has to meet and has not; a peer that is silent for `lease` seconds is lost to it.
+    """
+
+    who: str
+    session: str
+    version: str
+    listen: str
+    machine: str
+    lease: float
+    lacks: list[str]
+
+
+class Leaving(Frozen):
+    """`who` leaves, because `reason`."""
+
+    who: str
+    reason: str
+
+
 class Ready(Frozen):
     """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains.
 
@@ -156,7 +179,8 @@ class Ready(Frozen):
 class Control(Frozen):
     """The coordinator's word.
 
-    "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`.
+    "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`;
+    "tell": say again whom you lack.
     `external` names the nodes whose measurements come from a sensor, not from the simulated plant.
 
     A paced run has a `period` in seconds, 0 in lock-step. From a step's mode on a node waits for its measurement for
@@ -164,7 +188,7 @@ class Control(Frozen):
     while it goes on is told to "start" too: `step` is the next one.
     """
 
-    order: Literal["start", "close", "stop"]
+    order: Literal["start", "close", "stop", "tell"]
     steps: int
     seed: int
     window: int
@@ -177,6 +201,7 @@ class Control(Frozen):
     gains: str = ""
     identity: str = ""  # of this run alone, though others have its name
     faults: list[str] = Field(default=[])
+    version: str = ""  # of the coordinator
 
 
 class Facts(Frozen):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import NamedTuple
 
 from agent.network.session import Channel
@@ -23,13 +24,13 @@ class Arrival(NamedTuple):
 class Arrivals:
     """What comes on these channels from now on, which nobody else may ask for any more; a thread for each waits there.
 
-    A thread's clock is read when the message is there, whatever the one who computes is doing.
+    A thread's clock is read when the message is there, whatever the one who computes is doing. `in_thread` starts it.
     """
 
-    def __init__(self, channels: Iterable[Channel]) -> None:
+    def __init__(self, channels: Iterable[Channel], *, in_thread: Callable[..., None] | None = None) -> None:
         self._queue: SimpleQueue[Arrival | None] = SimpleQueue()  # None: a channel has closed
         for channel in channels:
-            threading.Thread(target=self._watch, args=(channel,), daemon=True, name="arrivals").start()
+            (in_thread or _daemon)(partial(self._watch, channel), name="arrivals")
 
     def until(self, deadline: float) -> Iterator[Arrival]:
         """What has arrived, once something has; nothing where the deadline passes first. Raises ChannelClosed."""
@@ -51,3 +52,7 @@ class Arrivals:
                 self._queue.put(Arrival(sample, time.monotonic()))
         except ChannelClosed:
             self._queue.put(None)
+
+
+def _daemon(work: Callable[[], None], *, name: str) -> None:
+    Thread(target=work, daemon=True, name=name).start()

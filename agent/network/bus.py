@@ -22,27 +22,41 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Set
+from contextlib import suppress
+from importlib.metadata import version
+from threading import Thread
 from types import FrameType, TracebackType
 from typing import NoReturn, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from agent.contract.errors import InputError, Interrupted, RunBroken, first_fault
-from agent.contract.keys import ACKNOWLEDGED, CONTROL, COORDINATOR, FACTS, RECORDER, in_words, model_of, ready, refused
-from agent.contract.messages import Acknowledged, Control, Estimate, Facts, Message, Ready
+from agent.contract.errors import Interrupted, PeakmeshError, RunBroken, first_fault
+from agent.contract.keys import (
+    ACKNOWLEDGED,
+    CONTROL,
+    COORDINATOR,
+    FACTS,
+    RECORDER,
+    in_words,
+    joining,
+    leaving,
+    model_of,
+    ready,
+    refused,
+)
+from agent.contract.messages import Acknowledged, Control, Estimate, Facts, Joining, Leaving, Message, Ready
+from agent.network.barrier import REASON_SECONDS, Barrier
 from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
 from agent.network.words import (
     Incoming,
     Namesake,
-    Orphaned,
     Peer,
     Refused,
     Replayed,
     RunClosed,
     Sample,
-    UnderWay,
     Words,
 )
 from agent.signals import Handler, Handlers, heed, restore
@@ -51,11 +65,12 @@ from agent.signals import Handler, Handlers, heed, restore
 REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
 CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
 LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
+THREAD_SECONDS = 5.0  # for a thread to end once the session is closed
 GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
 ASK_SECONDS = 0.15  # and asks again
 
 T = TypeVar("T")
-Word = TypeVar("Word", Control, Acknowledged, Ready)
+Word = TypeVar("Word", Control, Acknowledged, Joining, Leaving, Ready)
 
 
 class Bus:
@@ -77,7 +92,6 @@ class Bus:
         self.run, self.who, self.network = run, who, network
         self._words = Words(who)
         self._outbox = Outbox(who)
-        self._expected: set[str] = set()  # who takes part
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._ready: Ready | None = None  # what we have told the coordinator
@@ -86,7 +100,17 @@ class Bus:
         self._given_up = math.inf  # when it is not waited for any more
         self.step = 0  # of a paced run: the first of which we have had no mode
         self.identity = ""  # of the run
+        self._threads: list[Thread] = []
         self._session = session(network, run=run, who=who, hand_over=self._words.put)
+        self._barrier = Barrier(
+            network,
+            run=run,
+            who=who,
+            identity=self._session.identity,
+            words=self._words,
+            say=self._say,
+            heed_namesake=self._heed_namesake,
+        )
         self._handlers = signals(self._on_signal)
 
     def __enter__(self) -> Self:
@@ -96,9 +120,26 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
+            if error is not None and not isinstance(error, Refused):
+                self._say_why(error)
             self._session.close()
+            for thread in self._threads:  # at exit it would come back from zenoh into an interpreter that is gone
+                thread.join(THREAD_SECONDS)
         finally:
             restore(self._handlers)
+
+    def _say_why(self, error: BaseException) -> None:
+        """Tell the coordinator why we go, as far as it can still be told."""
+        if self.who != COORDINATOR and COORDINATOR in self.present:
+            reason = str(error) if isinstance(error, PeakmeshError) else f"{type(error).__name__}: {error}"
+            with suppress(Exception):  # the first error is the one to be raised
+                self._say(leaving(self.who), Leaving(who=self.who, reason=reason))
+
+    def in_thread(self, work: Callable[[], None], *, name: str) -> None:
+        """Do `work` beside the main thread; it ends by ChannelClosed once the session is closed, and is waited for."""
+        thread = Thread(target=work, daemon=True, name=name)
+        self._threads.append(thread)
+        thread.start()
 
     def locators(self) -> list[str]:
         """The addresses at which others can connect, but for the socket that those of a run on one machine know."""
@@ -126,7 +167,10 @@ class Bus:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
         if self.who in (COORDINATOR, RECORDER):
             self._listen(ready("*"), Ready)
-        if self.who != COORDINATOR:
+        if self.who == COORDINATOR:
+            self._listen(joining("*"), Joining)
+            self._listen(leaving("*"), Leaving)
+        else:
             self._listen(CONTROL, Control)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
@@ -160,29 +204,22 @@ class Bus:
         self._outbox.forget(acknowledged.received.get(self.who, 0))
         self._last_word = acknowledged if acknowledged.closed else None
 
-    # Start together.
-    def meet(self, others: Iterable[str]) -> Iterator[str]:
-        """Wait for everybody's token, and yield who has come; RunBroken names who is missing when time is over."""
-        self._expected = set(others) - {self.who}
-        absent = set(self._expected)
-        deadline = time.monotonic() + self.network.wait
-        while absent:
-            who = self._wait_for(Peer, deadline=deadline, missing=absent).who
-            if who in absent:
-                absent.remove(who)
-                yield who
+    # Start together; `barrier` has the rest.
+    def meet(self, others: Iterable[str], *, warn: Callable[[str], None] = lambda sentence: None) -> Iterator[str]:
+        """Wait for everybody's token, and yield who has come; RunBroken names who is missing when time is over.
+
+        `warn` is told, at the coordinator, of what is not as it should be with those who join.
+        """
+        self._barrier.warn = warn
+        return self._barrier.meet(others)
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
         """The coordinator's: wait until everybody has met everybody. InputError where a name is there twice."""
-        answers: dict[str, Ready] = {}
-        unready = set(others) - {self.who}
-        deadline = time.monotonic() + self.network.wait
-        while unready:
-            answer = self._wait_for(Ready, deadline=deadline, missing=unready)
-            if answers.setdefault(answer.who, answer).session != answer.session:
-                raise InputError(f"{in_words(answer.who)} takes part twice; start it once")
-            unready.discard(answer.who)
-        return answers
+        return self._barrier.gather(others)
+
+    def wait_for_start(self) -> Control:
+        """The coordinator's order to start, with the facts of the run."""
+        return self._barrier.wait_for_start()
 
     def report_ready(self, gains: str) -> None:
         """Tell the coordinator that we have met everybody, and which gains we run on."""
@@ -225,50 +262,6 @@ class Bus:
                         heed(word)
         raise RunBroken(f"the recorder did not greet {in_words(self.who)} within {seconds:g} s; start it again")
 
-    def wait_for_start(self) -> Control:
-        """The coordinator's order to start, with the facts of the run."""
-        deadline = time.monotonic() + self.network.wait
-        return self._wait_for(Control, deadline=deadline, missing={COORDINATOR})
-
-    def _wait_for(self, kind: type[T], *, deadline: float, missing: set[str]) -> T:
-        """The next word of one kind; what else comes is kept for `receive`."""
-        if (early := self._words.early(kind)) is not None:
-            return early
-        left = ""  # who went away; the coordinator's word on it may be on its way
-        while True:
-            word = self._words.take(deadline)
-            if word is None:
-                if time.monotonic() >= deadline:
-                    raise RunBroken(left or self._who_is_missing(missing))
-                continue
-            match word:
-                case Control(order="close" | "stop"):
-                    raise RunClosed(word)
-                case Control(step=step) if kind is not Control and step:
-                    raise UnderWay(word)
-                case Namesake(identity=identity):
-                    self._heed_namesake(identity)
-                    continue
-                case Ready(underway=True):
-                    raise Orphaned(word)
-                case Peer(who=who, present=False) if who in self._expected:
-                    left = left or f"{in_words(who)} left before the run had started"
-                    deadline = min(deadline, time.monotonic() + (0.0 if self.who == COORDINATOR else LEAVE_SECONDS))
-                    continue
-            if isinstance(word, kind):
-                return word
-            self._words.set_aside(word)
-
-    def _who_is_missing(self, missing: set[str]) -> str:
-        if self._words.alone and self.network.connect:
-            where = ", ".join(self.network.connect)
-            return (
-                f'nobody of run "{self.run}" answered at {where} within {self.network.wait:g} s; '
-                "is the coordinator running there, under the same --run?"
-            )
-        names = " and ".join(map(in_words, sorted(missing)))
-        return f"{names} did not join the run within {self.network.wait:g} s"
-
     # Run.
     def publish(self, topic: str, message: Message) -> None:
         """Send a data message, and keep it until the recorder has it."""
@@ -303,6 +296,14 @@ class Bus:
     def _underway(self) -> dict[str, object]:
         return {"underway": True, "step": self.step, "identity": self.identity}
 
+    def reason_of(self, who: str) -> str:
+        """Why somebody has gone who is gone; "" where it has not said."""
+        reasons, deadline = self._words.reasons, time.monotonic() + REASON_SECONDS
+        while who not in reasons and time.monotonic() < deadline:
+            if (word := self._words.take(deadline)) is not None:
+                self._words.set_aside(word)
+        return reasons.get(who, "")
+
     def fail(self, error: BaseException) -> None:
         """Have the main thread raise `error`; called by the thread that computes."""
         self._words.put(lambda: _raise(error))
@@ -310,7 +311,7 @@ class Bus:
     def order(self, control: Control) -> None:
         """The coordinator's word to everybody."""
         self.has_begun = self.has_begun or control.order == "start"
-        self._say(CONTROL, control)
+        self._say(CONTROL, control.model_copy(update={"version": version("peakmesh")}))
 
     def acknowledge(self, acknowledged: Acknowledged) -> None:
         """The recorder's word to everybody."""
@@ -345,11 +346,15 @@ class Bus:
             pass
         return self._last_word
 
-    def wait_until_gone(self, whos: Iterable[str]) -> None:
-        """Stay until they have gone, so that our last word is sure to have reached them; but not for long."""
+    def wait_until_gone(self, whos: Iterable[str], *, greet: Callable[[], None] = lambda: None) -> None:
+        """Stay until they have gone, so that our last word is sure to have reached them; but not for long.
+
+        Whoever comes only now is told it by `greet`.
+        """
         names, present = set(whos), self._words.present
-        for _ in self._until(lambda: not names & present, silence=LEAVE_SECONDS):
-            pass
+        for word in self._until(lambda: not names & present, silence=LEAVE_SECONDS):
+            if isinstance(word, Peer) and word.present and word.who in names:
+                greet()
 
     def _until(self, condition: Callable[[], bool], *, silence: float) -> Iterator[Incoming | None]:
         """What comes until the condition holds, or for `silence` seconds nothing has come; None as from `take`."""

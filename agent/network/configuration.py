@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import secrets
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+from agent.network.addresses import MULTICAST, NONE
 from agent.network.links import Sockets
 
-LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
+ATTEMPT_MS = 500  # that a client tries to connect before it looks up
 BUFFER = 16_384  # bytes, of each direction of each link; messages are small, links are many
 MANY = 1000  # more than anybody has links
 
@@ -17,32 +18,41 @@ MANY = 1000  # more than anybody has links
 class Network:
     """Where to listen, whom to connect to (one peer of the run is enough), how long to wait for the others.
 
-    In a run on one machine everybody has `sockets`, and links with those alone to whom they lead.
+    Who listens nowhere, `NONE`, is a client: everything goes through the one that it is connected to. `MULTICAST` finds
+    whom to connect to by asking the local network. In a run on one machine everybody has `sockets`, and links with
+    those alone to whom they lead. A peer that is silent for `lease` seconds is lost; a killed one is seen at once.
     """
 
     listen: str = "tcp/127.0.0.1:0"
     connect: tuple[str, ...] = ()
     wait: float = 30.0  # seconds
+    lease: float = 20.0  # seconds
+    routes: bool = False  # takes no part, but passes on what others say
     sockets: Sockets | None = None
+
+    @property
+    def kind(self) -> Literal["peer", "client", "router"]:
+        """What this is to Zenoh."""
+        return "router" if self.routes else "client" if self.listen == NONE else "peer"
 
 
 def zenoh_configuration(network: Network) -> dict[str, Any]:
-    """Peer mode without multicast: one known address is enough, gossip makes the mesh.
+    """One known address is enough: gossip makes the mesh of the peers.
 
-    Connecting goes on in the background, so that a signal is heeded meanwhile; the barrier waits for everybody.
+    Peers connect in the background, so that a signal is heeded meanwhile; the barrier waits for everybody.
     """
     configuration: dict[str, Any] = {
-        "mode": "peer",
-        "listen": {"endpoints": [network.listen]},
+        "mode": network.kind,
+        "listen": {"endpoints": [network.listen] if network.listen != NONE else []},
         "connect": {
-            "endpoints": list(network.connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
+            "endpoints": [address for address in network.connect if address != MULTICAST],
+            "timeout_ms": ATTEMPT_MS if network.kind == "client" else -1,
+            "exit_on_failure": network.kind == "client",
             "retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 1.5},
         },
         "open": {"return_conditions": {"connect_scouted": False, "declares": False}},
         "scouting": {
-            "multicast": {"enabled": False},
+            "multicast": {"enabled": MULTICAST in network.connect, "autoconnect": {"client": ["router", "peer"]}},
             "gossip": {
                 "enabled": True,
                 "autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
@@ -51,7 +61,7 @@ def zenoh_configuration(network: Network) -> dict[str, Any]:
         "adminspace": {"enabled": True},  # tells the port that 0 became
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {"tx": {"lease": LEASE_MS, "batch_size": BUFFER}, "rx": {"buffer_size": BUFFER}},
+            "link": {"tx": {"lease": round(1000 * network.lease), "batch_size": BUFFER}, "rx": {"buffer_size": BUFFER}},
         },
     }
     if network.sockets is not None:

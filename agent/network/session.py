@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import zenoh
@@ -58,6 +59,7 @@ class Session:
         self._shown: dict[str, zenoh.Publisher] = {}  # the same for viewers
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
+        self._kind = network.kind
         self._zenoh = _open(network)
         self._zid = str(self._zenoh.zid())
         self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first
@@ -198,18 +200,20 @@ class Session:
 
     # The session itself.
     def locators(self) -> list[str]:
-        """The addresses at which it can be reached."""
-        for reply in self._zenoh.get(f"@/{self._zid}/peer"):
+        """The addresses at which it can be reached; none where it listens nowhere."""
+        if self._kind == "client":
+            return []
+        for reply in self._zenoh.get(f"@/{self._zid}/{self._kind}"):
             if reply.ok is not None:
                 return list(json.loads(reply.ok.payload.to_bytes())["locators"])
         raise RunBroken("zenoh does not tell its own address")
 
     def close(self) -> None:
         """Withdraw what was declared, the last first: where that is the token, the others see us go."""
-        try:
+        with suppress(zenoh.ZError):  # somebody does not answer; what there was to say has been said
             for declared in reversed(self._declared):
                 declared.undeclare()
-        finally:
+        with suppress(zenoh.ZError):
             self._zenoh.close()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
 
 
@@ -226,13 +230,28 @@ def _sample(topic: str, sample: zenoh.Sample) -> Sample:
 
 def _replayed(reply: zenoh.Reply) -> Sample | None:
     sample = reply.ok
-    return _sample(topic_of(str(sample.key_expr)), sample) if sample is not None else None
+    if sample is None or str(sample.key_expr).count("/") < 2:  # anybody may answer, under any key
+        return None
+    return _sample(topic_of(str(sample.key_expr)), sample)
 
 
 def _open(network: Network) -> zenoh.Session:
-    try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(zenoh_configuration(network))))
-    except zenoh.ZError as error:
-        reason = str(error)
-        cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
-        raise InputError(f"cannot listen on {network.listen}: {cause}; port 0 takes a free one") from None
+    """A client is there once it is connected; signals are heeded between its attempts."""
+    config, deadline = json.dumps(zenoh_configuration(network)), time.monotonic() + network.wait
+    while True:
+        try:
+            return zenoh.open(zenoh.Config.from_json5(config))
+        except zenoh.ZError as error:
+            if network.kind != "client":
+                raise _not_open(network, str(error)) from None
+        if time.monotonic() >= deadline:
+            where = ", ".join(network.connect)
+            raise RunBroken(f"nobody answered at {where} within {network.wait:g} s; is the coordinator running there?")
+
+
+def _not_open(network: Network, reason: str) -> InputError:
+    """An address that looks well, and which Zenoh cannot use all the same."""
+    cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
+    if "in use" in reason or "listen" in reason.lower() or not network.connect:
+        return InputError(f"cannot listen on {network.listen}: {cause}; port 0 takes a free one")
+    return InputError(f"cannot connect to {', '.join(network.connect)}: {cause}")

@@ -12,7 +12,7 @@ from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
 from agent.contract.errors import InputError
-from agent.contract.messages import Acknowledged, Control, Facts, Ready, Stamp
+from agent.contract.messages import Acknowledged, Control, Facts, Joining, Leaving, Ready, Stamp
 
 
 class Sample(NamedTuple):
@@ -42,7 +42,7 @@ class Replayed(NamedTuple):
     who: str
 
 
-Incoming = Sample | Peer | Namesake | Control | Acknowledged | Ready | Replayed | Facts
+Incoming = Sample | Peer | Namesake | Control | Acknowledged | Joining | Leaving | Ready | Replayed | Facts
 Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
 T = TypeVar("T")
 
@@ -84,6 +84,7 @@ class Words:
 
     def __init__(self, who: str) -> None:
         self.present: set[str] = set()  # whose token is there
+        self.reasons: dict[str, str] = {}  # why those have gone who have said so
         self.alone = True  # nobody else of this run has been heard
         self.taken = 0  # duties done so far
         self._who = who
@@ -115,6 +116,8 @@ class Words:
                 return None  # a namesake has gone; we have not
             case Peer(who=who):
                 self.present.discard(who)
+            case Leaving(who=who, reason=reason):
+                self.reasons[who] = reason
         return word
 
     def set_aside(self, word: Incoming) -> None:

@@ -50,15 +50,16 @@ class Summary(NamedTuple):
 
 
 # what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}, {"broken_off": sentence},
-# {"ending": why}
+# {"ending": why}, {"warning": sentence}
 Word = dict[str, Any]
 
 
 class Lost(RunBroken):
     """A participant that is gone."""
 
-    def __init__(self, who: str) -> None:
-        super().__init__(f"{in_words(who)} was lost: its process ended, or the network to it failed")
+    def __init__(self, who: str, reason: str = "") -> None:
+        why = f"; it said: {reason}" if reason else ""
+        super().__init__(f"{in_words(who)} was lost: its process ended, or the network to it failed{why}")
         self.who = who
 
 
@@ -153,7 +154,8 @@ class Conductor:
                 self._order("start")
 
     def _gather(self) -> None:
-        for who in self._bus.meet([*self._everybody, *map(sensor_who, self._plan.external)]):
+        everybody = [*self._everybody, *map(sensor_who, self._plan.external)]
+        for who in self._bus.meet(everybody, warn=lambda sentence: self._report({"warning": sentence})):
             self._report({"joined": who})
         self._refuse_other_gains(self._bus.gather(self._everybody))
 
@@ -218,7 +220,7 @@ class Conductor:
         self._order("stop", reason)
         if self._started:
             return self._bus.wait_for_close()
-        self._bus.wait_until_gone(self._everybody)
+        self._bus.wait_until_gone(self._everybody, greet=lambda: self._order("stop", reason))
         return None
 
     def _order(self, order: Literal["start", "close", "stop"], reason: str = "") -> None:
@@ -260,7 +262,7 @@ class Conductor:
                     silent = False
                     self._heed(acknowledged.broken_off)
                 case Peer(who=who, present=False) if self._takes_part(who):
-                    raise Lost(who)
+                    raise Lost(who, self._bus.reason_of(who))
         self._report_progress()
 
     def _report_progress(self) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from importlib.metadata import version
 
 from agent.contract.errors import InputError, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import PLANT, RECORDER, in_words
+from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words
 from agent.contract.messages import Control
+from agent.network.acquaintance import refuse_version
 from agent.network.bus import Bus
 from agent.network.links import linked
 from agent.network.words import ChannelClosed, RunClosed, UnderWay
@@ -41,6 +42,7 @@ def _met(bus: Bus, gains: Gains) -> Control:
     except UnderWay as run:
         start = run.start
         bus.report_ready(gains.digest())
+    refuse_version(COORDINATOR, start.version, own=version("peakmesh"))
     if start.step and start.gains != gains.digest():
         raise InputError(
             f"the run that {in_words(bus.who)} would join has other gains ({start.gains[:12]}...) than its own "
@@ -65,7 +67,7 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
         except Exception as error:
             bus.fail(error)
 
-    threading.Thread(target=guarded, daemon=True, name="work").start()
+    bus.in_thread(guarded, name="work")
     try:
         while True:
             bus.receive()

@@ -60,9 +60,8 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         arriving = Arriving(faults, problem, node, seed=start.seed)
         ordeal = Ordeal(faults, node_who(node), begin=start.step)
-        _against_the_clock(
-            bus, paced, Arrivals([modes, measurements, *estimates.values()]), node, arriving=arriving, ordeal=ordeal
-        )
+        arrivals = Arrivals([modes, measurements, *estimates.values()], in_thread=bus.in_thread)
+        _against_the_clock(bus, paced, arrivals, node, arriving=arriving, ordeal=ordeal)
 
     take_part(bus, gains, work)
 

@@ -6,7 +6,6 @@ messages, and is never used for recording.
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Iterator, Set
 from contextlib import closing, contextmanager
@@ -119,8 +118,6 @@ def stopped_by_signals() -> Iterator[None]:
         raise Interrupted(number)
 
     before = heed(stop)
-    if signal.SIGHUP not in before and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, stop)
     try:
         yield
     finally:

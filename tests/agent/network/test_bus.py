@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -12,12 +14,13 @@ import pytest
 from runs import PATIENCE
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
-from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
-from agent.contract.messages import Acknowledged, Control, Mode
-from agent.network import bus
+from agent.contract.keys import CONTROL, COORDINATOR, EVENT, MODE, PLANT, PLANT_STATE, RECORDER
+from agent.contract.messages import Acknowledged, Control, Event, Mode, PlantState
+from agent.network import barrier, bus
+from agent.network.addresses import NONE
 from agent.network.bus import REPLAY_SECONDS, Bus
 from agent.network.configuration import Network
-from agent.network.words import Incoming, Peer, Refused, Replayed, RunClosed, Sample
+from agent.network.words import ChannelClosed, Incoming, Peer, Refused, Replayed, RunClosed, Sample
 
 
 @pytest.fixture
@@ -179,14 +182,20 @@ def test_a_coordinator_that_may_come_back_is_not_waited_for_for_ever(coordinator
 
 @pytest.mark.parametrize("ignored", [False, True])
 def test_handlers_are_given_back(ctrl_c: None, ignored: bool) -> None:
-    """Whoever had the signals before has them again afterwards; a SIGINT that is ignored stays so all the time."""
-    if ignored:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with Bus(Network(), run="test", who=COORDINATOR):
-        heeded = {number for number, handler in before.items() if signal.getsignal(number) != handler}
-    assert heeded == ({signal.SIGTERM} if ignored else {signal.SIGINT, signal.SIGTERM})
-    assert {number: signal.getsignal(number) for number in before} == before
+    """Whoever had the signals before has them again afterwards; what is ignored stays so all the time."""
+    may_be_ignored = {signal.SIGINT, signal.SIGHUP}
+    whose = signal.SIG_IGN if ignored else signal.SIG_DFL
+    given = {number: signal.signal(number, whose) for number in may_be_ignored}
+    before = {number: signal.getsignal(number) for number in (*may_be_ignored, signal.SIGTERM)}
+    try:
+        with Bus(Network(), run="test", who=COORDINATOR):
+            heeded = {number for number, handler in before.items() if signal.getsignal(number) != handler}
+        after = {number: signal.getsignal(number) for number in before}
+    finally:
+        for number, handler in given.items():
+            signal.signal(number, handler)
+    assert heeded == {signal.SIGTERM} | (set() if ignored else may_be_ignored)
+    assert after == before
 
 
 def test_who_is_missing_is_named(coordinator: Bus) -> None:
@@ -199,7 +208,8 @@ def test_who_is_missing_is_named(coordinator: Bus) -> None:
             pass
         plant._words.set_aside(there)  # it has come, however long that took
         started = time.monotonic()
-        with pytest.raises(RunBroken, match=r'^node "1" and the recorder did not join the run within 0\.3 s$'):
+        said = 'has reached the coordinator, but within 0.3 s not node "1" and the recorder'
+        with pytest.raises(RunBroken, match=re.escape(f"the plant, which listens at {impatient.listen}, {said}")):
             list(plant.meet([COORDINATOR, RECORDER, "node-1"]))
         assert time.monotonic() - started >= 0.3
 
@@ -249,3 +259,103 @@ def test_a_name_that_is_there_twice_is_refused(coordinator: Bus) -> None:
         else:
             said = ""
     assert re.fullmatch(r"the plant takes part .*; start it once", said)
+
+
+def test_who_cannot_meet_is_named_by_the_coordinator(coordinator: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It asks those who are there whom they lack, and says which two have no link; then everybody can say so."""
+    monkeypatch.setattr(barrier, "WORD_SECONDS", PATIENCE)
+    with Bus(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), run="test", who=PLANT) as plant:
+        plant.enter()
+        ended = list[Control]()
+
+        def meet() -> None:
+            try:
+                list(plant.meet([COORDINATOR, RECORDER]))
+            except RunClosed as closed:
+                ended.append(closed.control)
+
+        thread = threading.Thread(target=meet)
+        thread.start()
+        list(coordinator.meet([PLANT]))
+        recorder = {"who": RECORDER, "listen": "tcp/[::1]:9", "lacks": [PLANT]}
+        coordinator._barrier._acquaintance.heed(plant._barrier._joining().model_copy(update=recorder))
+        said = coordinator._barrier._strangers({PLANT})
+        coordinator.order(Control(order="stop", steps=1, seed=0, window=1, external=[], reason=said))
+        thread.join(PATIENCE)
+    assert [control.reason for control in ended] == [said]
+    assert "the recorder and the plant have reached the coordinator, but have no link between them: " in said
+    assert f"the recorder listens at tcp/[::1]:9, the plant at {plant.network.listen}; " in said
+
+
+def leave(network: Network, *, closed: bool = False) -> None:
+    """Take part as the plant, and go because of an error; `closed`: after the session has failed."""
+    with Bus(network, run="test", who=PLANT) as plant:
+        plant.enter()
+        list(plant.meet([COORDINATOR]))
+        if closed:
+            plant._session._zenoh.close()
+        raise RunBroken("no sugar")
+
+
+def test_who_goes_says_why(coordinator: Bus) -> None:
+    """The coordinator learns what happened on another machine, before the start and after it."""
+    network = Network(connect=(coordinator.locators()[0],), wait=PATIENCE)
+    with pytest.raises(RunBroken, match="no sugar"):
+        leave(network)
+    with pytest.raises(RunBroken, match="the plant left before the run had started; it said: no sugar"):
+        list(coordinator.meet([PLANT, RECORDER]))
+    with pytest.raises(RunBroken, match="no sugar"):
+        leave(network)
+    while coordinator.receive(timeout=PATIENCE) != Peer(PLANT, present=False):
+        pass
+    assert coordinator.reason_of(PLANT) == "no sugar"
+
+
+def test_what_went_wrong_first_is_what_is_raised(coordinator: Bus) -> None:
+    """Also where the session cannot be closed any more."""
+    with pytest.raises(RunBroken, match="no sugar"):
+        leave(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), closed=True)
+
+
+def test_threads_have_ended_when_a_participant_has_left(coordinator: Bus) -> None:
+    """At exit they would come back from zenoh into an interpreter that is gone."""
+    network = Network(connect=(coordinator.locators()[0],), wait=PATIENCE)
+    threads = list[threading.Thread]()
+    with Bus(network, run="test", who=PLANT) as plant:
+        channel = plant.channel(MODE)
+
+        def wait() -> None:
+            threads.append(threading.current_thread())
+            with contextlib.suppress(ChannelClosed):
+                channel.next()
+
+        plant.in_thread(wait, name="waiting")
+    assert [thread.is_alive() for thread in threads] == [False]
+
+
+def test_a_client_takes_part(coordinator: Bus) -> None:
+    """It listens nowhere: everything goes through the coordinator, to and from peers that it has no link with."""
+    address = coordinator.locators()[0]
+    peer, client = Network(connect=(address,), wait=PATIENCE), Network(NONE, (address,), PATIENCE)
+    with Bus(peer, run="test", who=RECORDER) as recorder, Bus(client, run="test", who=PLANT) as plant:
+        channel, back = recorder.channel(PLANT_STATE), plant.channel(EVENT)
+        plant.advertise([PLANT_STATE])
+        recorder.advertise([EVENT])
+        for one in (recorder, plant):
+            one.enter()
+        assert plant.locators() == []
+        list(recorder.meet([COORDINATOR, PLANT]))
+        list(plant.meet([COORDINATOR, RECORDER]))
+        for step in range(100):
+            plant.publish(PLANT_STATE, PlantState(step=step, x=[0.0], z=[0.0], w=[0.0], arrived=[1]))
+            recorder.publish(EVENT, Event(step=step, kind="a", who=RECORDER, detail=""))
+        assert [PlantState.decode(channel.next().payload).step for _ in range(100)] == list(range(100))
+        assert [Event.decode(back.next().payload).step for _ in range(100)] == list(range(100))
+        recorder.request_replay(PLANT, first=90)
+        answer(plant)
+        assert len(list(recorder.replayed([PLANT]))) == 10
+
+
+def test_a_client_that_reaches_nobody_says_so() -> None:
+    with pytest.raises(RunBroken, match=r"nobody answered at tcp/127\.0\.0\.1:1 within 0\.1 s"):
+        Bus(Network(NONE, ("tcp/127.0.0.1:1",), 0.1), run="test", who=PLANT)
