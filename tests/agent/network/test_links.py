@@ -87,3 +87,11 @@ def test_peers_pass_on_neither_tokens_nor_words(tmp_path: Path) -> None:
         with pytest.raises(RunClosed, match="enough"):
             drain(plant)
         assert plant.present == {COORDINATOR, PLANT}
+
+
+def test_a_session_has_one_pool_of_threads() -> None:
+    """Zenoh reads the variable that asks for it once; a version that no longer does makes this fail."""
+    with Bus(Network(), run="test", who=COORDINATOR):
+        names = {(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()}
+    assert "rx-0" in names
+    assert not [name for name in names if name.startswith(("tx-", "net-", "acc-", "app-"))]
