@@ -31,6 +31,7 @@ from agent.contract.recording.reader import RecordingReader
 GOLDEN = Path(__file__).parents[1] / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 SEED = 1
 TICK = os.sysconf("SC_CLK_TCK")
+POOLS = ("rx-", "tx-", "net-", "acc-", "app-")  # names of Zenoh's threads
 
 
 def main() -> None:
@@ -59,9 +60,12 @@ def main() -> None:
     print(f"\nthe last peakmesh run: step 0 after {run['start_seconds']:.2f} s; per round")
     for who, use in run["use"].items():
         print(
-            f"  {who:14} {use['user']:5.0f} us user {use['system']:5.0f} us system {use['switches']:6.1f} waits"
-            f"   {use['megabytes_at_first']:4.0f} MB resident at first, {use['megabytes']:.0f} MB at last"
+            f"  {who:14} {use['user']:5.0f} us user {use['system']:5.0f} us system, {use['zenoh']:5.0f} us of both in "
+            f"Zenoh's threads {use['switches']:6.1f} waits   {use['megabytes_at_first']:4.0f} MB resident at first, "
+            f"{use['megabytes']:.0f} MB at last"
         )
+    whole = sum(use["user"] + use["system"] for use in run["use"].values())
+    print(f"  {'together':14} {whole:5.0f} us of processor time, {1e6 / run['rate']:.0f} us passed")
 
 
 def peakmesh(path: Path, gains: Gains, steps: int, window: int | None) -> dict[str, Any]:
@@ -117,13 +121,16 @@ class Watcher(threading.Thread):
         """Per round, of each process."""
         found = {}
         for who, last in sorted(self._last.items()):
-            user, system, switches = (1e6 * (b - a) / steps for a, b in zip(self._first[who], last[:3], strict=False))
+            user, system, zenoh, switches = (
+                1e6 * (b - a) / steps for a, b in zip(self._first[who], last[:4], strict=False)
+            )
             found[who] = {
                 "user": user,
                 "system": system,
+                "zenoh": zenoh,
                 "switches": switches / 1e6,
-                "megabytes_at_first": self._first[who][3],
-                "megabytes": last[3],
+                "megabytes_at_first": self._first[who][4],
+                "megabytes": last[4],
             }
         return found
 
@@ -151,15 +158,19 @@ def role(pid: int) -> str:
 
 
 def counted(pid: int) -> list[float]:
-    """CPU seconds (user, system), voluntary context switches of all threads, resident megabytes."""
+    """CPU seconds (user, system, of both in Zenoh's threads), voluntary context switches, resident megabytes."""
+    used, zenoh, switches = [0.0, 0.0], 0.0, 0.0
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        tasks = [Path(f"/proc/{pid}/task/{task}/status").read_text() for task in os.listdir(f"/proc/{pid}/task")]
-        status = Path(f"/proc/{pid}/status").read_text()
+        resident = _field(Path(f"/proc/{pid}/status").read_text(), "VmRSS") / 1024
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            name, _, fields = (task / "stat").read_text().partition("(")[2].rpartition(")")
+            seconds = [int(ticks) / TICK for ticks in fields.split()[11:13]]
+            used = [a + b for a, b in zip(used, seconds, strict=True)]
+            zenoh += sum(seconds) if name.startswith(POOLS) else 0.0
+            switches += _field((task / "status").read_text(), "voluntary_ctxt_switches")
     except OSError:
         return []
-    switches = sum(_field(text, "voluntary_ctxt_switches") for text in tasks)
-    return [int(stat[11]) / TICK, int(stat[12]) / TICK, switches, _field(status, "VmRSS") / 1024]
+    return [*used, zenoh, switches, resident]
 
 
 def _field(status: str, name: str) -> int:

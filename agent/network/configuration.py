@@ -72,10 +72,10 @@ def zenoh_configuration(network: Network) -> dict[str, Any]:
 def _keep_to(sockets: Sockets, configuration: dict[str, Any], *, listen: list[str]) -> None:
     """Links over these sockets alone; but strangers (sensors, viewers) may connect to us.
 
-    They find us by gossip, as ever. Of two that could connect the one with the greater id does: ours is less than any
-    that zenoh draws from 128 bits.
+    They find us by gossip, as ever. Of two that could connect the one with the greater id does. Zenoh draws ids of 128
+    bits, and compares them from the last byte on; ours are less from either end.
     """
-    configuration["id"] = f"{secrets.randbits(64) or 1:x}"
+    configuration["id"] = f"{(secrets.randbits(64) or 1) << 32:x}"
     configuration["listen"]["endpoints"] = [*listen, sockets.listen]
     configuration["connect"]["endpoints"] = list(sockets.connect)
     configuration["scouting"]["gossip"]["autoconnect"] = {"peer": []}

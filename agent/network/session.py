@@ -7,6 +7,7 @@ is handed over as a duty, for the main thread to do.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -21,6 +22,10 @@ from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
 from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, Replayed, Sample
 from agent.plan import LARGEST_WINDOW
+
+# Zenoh's pools of threads as one. Else what arrives wakes a thread of the pool that has accepted the connection, that
+# wakes one of the pool that receives, and an answer one of the pool that sends. It counts from the first session on.
+os.environ.setdefault("ZENOH_RUNTIME", "(tx:(handover:rx),net:(handover:rx),acc:(handover:rx),app:(handover:rx))")
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
 BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word

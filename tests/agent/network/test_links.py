@@ -13,7 +13,7 @@ from agent.contract.keys import COORDINATOR, PLANT, RECORDER, node_who, particip
 from agent.contract.messages import Control
 from agent.contract.problem import Problem
 from agent.network.bus import Bus
-from agent.network.configuration import Network
+from agent.network.configuration import Network, zenoh_configuration
 from agent.network.links import Sockets, linked, sockets
 from agent.network.words import RunClosed
 from benchmarks.replay import ring
@@ -87,3 +87,32 @@ def test_peers_pass_on_neither_tokens_nor_words(tmp_path: Path) -> None:
         with pytest.raises(RunClosed, match="enough"):
             drain(plant)
         assert plant.present == {COORDINATOR, PLANT}
+
+
+def test_strangers_find_everybody(tmp_path: Path) -> None:
+    """A sensor, a viewer, a second process of a name: whoever connects to the coordinator gets links with the others.
+
+    It does where its id is greater than theirs, which zenoh draws.
+    """
+    hub, other = (f"unixsock-stream/{tmp_path / who}" for who in (COORDINATOR, PLANT))
+    inside = Network("", (), PATIENCE, sockets=Sockets(other, (hub,)))
+    least = int(zenoh_configuration(inside)["id"], 16)
+    assert max(least.to_bytes(16, order)[:4] for order in ("little", "big")) == bytes(4)
+    with (
+        Bus(Network(wait=PATIENCE, sockets=Sockets(hub, ())), run="test", who=COORDINATOR) as coordinator,
+        Bus(inside, run="test", who=PLANT) as plant,
+    ):
+        plant.enter()
+        (address,) = coordinator.locators()
+        with Bus(Network(connect=(address,), wait=PATIENCE), run="test", who=RECORDER) as stranger:
+            stranger.enter()
+            assert list(stranger.meet([PLANT])) == [PLANT]
+            assert list(plant.meet([RECORDER])) == [RECORDER]
+
+
+def test_a_session_has_one_pool_of_threads() -> None:
+    """Zenoh reads the variable that asks for it once; a version that no longer does makes this fail."""
+    with Bus(Network(), run="test", who=COORDINATOR):
+        names = {(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()}
+    assert "rx-0" in names
+    assert not [name for name in names if name.startswith(("tx-", "net-", "acc-", "app-"))]
