@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -19,9 +19,14 @@ from places import GOLDEN
 from roles import Roles
 from runs import MANY, answer, decoded, end_of, line_with, logged, peakmesh, program, started
 
+from agent.contract.errors import Interrupted
 from agent.contract.gains import Gains
 from agent.contract.messages import Estimate, PlantState
+from agent.network.arrivals import Arrival
+from agent.network.words import Sample
+from designer.commands.watch import _take_in
 from designer.replay import replay
+from designer.watch.scene import Scene
 
 GAINS = GOLDEN / "zhu2020-lossy.gains.json"
 NAMES = Gains.load(GAINS).problem.node_names
@@ -134,6 +139,37 @@ def what_was_shown_is_what_was_recorded(recording: Path, states: list[State]) ->
                 assert seen["error"] == pytest.approx(error, rel=1e-12)
                 compared += 1
     assert compared >= len(NAMES)
+
+
+class Silent:
+    """Somebody who looks on, and hears one message."""
+
+    facts, present = None, frozenset[str]()
+
+    def __init__(self, topic: str, payload: bytes) -> None:
+        self._arrival = Arrival(Sample(topic, payload, None), 0.0)
+
+    def until(self, deadline: float) -> Iterator[Arrival]:
+        yield self._arrival
+
+    def heed(self) -> None:
+        return
+
+
+@pytest.mark.parametrize("topic", ["mode", "nonsense", "event"])
+def test_what_is_no_message_is_counted_and_stops_nothing(topic: str) -> None:
+    scene = Scene("a-run")
+    _take_in(Silent(topic, b"nonsense"), scene, 0.0, "")  # type: ignore[arg-type]
+    assert scene.seen().unreadable == 1
+
+
+def test_a_signal_that_comes_while_a_message_is_read_is_heeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def signalled(topic: str, payload: bytes) -> NoReturn:
+        raise Interrupted(signal.SIGHUP)
+
+    monkeypatch.setattr("agent.contract.keys.decode", signalled)
+    with pytest.raises(Interrupted):
+        _take_in(Silent("mode", b"{}"), Scene("a-run"), 0.0, "")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("words", [["--run", "a/b"], ["--connect", "7447"], []])
