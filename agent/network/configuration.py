@@ -62,10 +62,10 @@ def zenoh_configuration(network: Network) -> dict[str, Any]:
 def _keep_to(sockets: Sockets, configuration: dict[str, Any], *, listen: list[str]) -> None:
     """Links over these sockets alone; but strangers (sensors, viewers) may connect to us.
 
-    They find us by gossip, as ever. Of two that could connect the one with the greater id does: ours is less than any
-    that zenoh draws from 128 bits.
+    They find us by gossip, as ever. Of two that could connect the one with the greater id does, its least significant
+    byte first: with zeros there, ours is less than any that zenoh draws.
     """
-    configuration["id"] = f"{secrets.randbits(64) or 1:x}"
+    configuration["id"] = f"{(secrets.randbits(63) or 1) << 64:x}"
     configuration["listen"]["endpoints"] = [*listen, sockets.listen]
     configuration["connect"]["endpoints"] = list(sockets.connect)
     configuration["scouting"]["gossip"]["autoconnect"] = {"peer": []}
