@@ -91,7 +91,8 @@ class Event(Message):
     """Something worth knowing: `kind` (a word), `who` says it, `detail` in words.
 
     In paced runs events also say what became of messages: `about` is a topic or a participant, `steps` are those of
-    which it is said, `seconds` by how much each of them was late, where that is known.
+    which it is said, `seconds` by how much each of them was late, where that is known, and `way` where the latest of
+    them spent its time once it was sent (`Way`), as far as Zenoh says; what is more than that the sender has taken.
     """
 
     kind: str = Field(description="what happened, in a word")
@@ -100,6 +101,20 @@ class Event(Message):
     about: str = Field(default="", description="in a paced run: the topic or the participant that it is said of")
     steps: list[int] = Field(default=[], max_length=1024, description="and the steps")
     seconds: list[float] = Field(default=[], max_length=1024, description="by how much each of them was late, in s")
+    way: list[float] = Field(
+        default=[], max_length=3, description="of the latest: seconds in sending, on the wire, in receiving"
+    )
+
+
+class Way(NamedTuple):
+    """Where a message spent its time, in s: in the sender's Zenoh, between that and the receiver's, and in the latter.
+
+    The second is by the clocks of both, and has their difference.
+    """
+
+    sending: float
+    wire: float
+    receiving: float
 
 
 class Account(Message):

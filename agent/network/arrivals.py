@@ -10,7 +10,8 @@ from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import NamedTuple
 
-from agent.network.session import Channel
+from agent.contract.messages import Way
+from agent.network.session import Channel, way_of
 from agent.network.words import ChannelClosed, Sample
 
 
@@ -19,6 +20,10 @@ class Arrival(NamedTuple):
 
     sample: Sample
     at: float
+
+    def way(self) -> Way | None:
+        """Where it spent its time, as far as it says."""
+        return way_of(self.sample.trace, self.at + time.time() - time.monotonic())
 
 
 class Arrivals:

@@ -267,6 +267,10 @@ class Bus:
         """Send a data message, and keep it until the recorder has it."""
         self._session.publish(self._outbox.add(topic, message.encode()))
 
+    def trace(self) -> None:
+        """Have what is published from now on say when it was where, so that a receiver knows why it is late."""
+        self._session.traced = True
+
     def receive(self, *, timeout: float = math.inf) -> Incoming | None:
         """The next word for the main thread; None where `timeout` seconds have passed.
 

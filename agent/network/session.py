@@ -7,6 +7,7 @@ is handed over as a duty, for the main thread to do.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -17,7 +18,7 @@ import zenoh
 
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.keys import COORDINATOR, alive, key, replay, run_of, session, speaker_of, topic_of, watch
-from agent.contract.messages import Stamp
+from agent.contract.messages import Stamp, Way
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
 from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, Replayed, Sample
@@ -29,6 +30,7 @@ os.environ.setdefault("ZENOH_RUNTIME", "(tx:(handover:rx),net:(handover:rx),acc:
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
 BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word
+TRACED = zenoh.TimestampInstrumentationBuilder().set_send(True).set_route(True).build()  # 1 µs a message
 DROP = zenoh.CongestionControl.DROP  # what viewers get: one that stands still must hold up nobody
 
 
@@ -65,6 +67,7 @@ class Session:
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._kind = network.kind
+        self.traced = False  # whether messages are to say when they were where
         self._zenoh = _open(network)
         self._zid = str(self._zenoh.zid())
         self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first
@@ -100,7 +103,8 @@ class Session:
 
     def publish(self, sent: Sent) -> None:
         """Send a message of an advertised topic; where a viewer is there, to it too, as long as it keeps up."""
-        self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode())
+        traced = TRACED if self.traced else None
+        self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode(), timestamp_instrumentation=traced)
         if self._watched[sent.topic]:
             self._shown[sent.topic].put(sent.payload)
 
@@ -230,7 +234,23 @@ def _sample(topic: str, sample: zenoh.Sample) -> Sample:
         raise RunBroken(f"a message on {topic} has no readable stamp: {error}") from None
     if stamp is not None and (speaker := speaker_of(str(sample.key_expr))) not in ("", stamp.sender):
         raise RunBroken(f"a message on {topic} from {speaker} says that it is from {stamp.sender}")
-    return Sample(topic, sample.payload.to_bytes(), stamp)
+    return Sample(topic, sample.payload.to_bytes(), stamp, sample.timestamp_stack)
+
+
+def way_of(trace: Any, at: float) -> Way | None:
+    """Where a message that arrived `at`, by time.time(), spent its time; None where it does not say."""
+    if trace is None:
+        return None
+    sent = [_seconds(record) for record in trace.records if record.point == zenoh.InterceptionPoint.SEND]
+    routed = [_seconds(record) for record in trace.records if record.point == zenoh.InterceptionPoint.ROUTE]
+    if not sent or len(routed) < 2:
+        return None
+    return Way(routed[0] - sent[0], routed[-1] - routed[0], at - routed[-1])
+
+
+def _seconds(record: zenoh.TimestampStackRecord) -> float:
+    stamp = record.timestamp()
+    return stamp.get_time().timestamp() if isinstance(stamp, zenoh.Timestamp) else math.nan
 
 
 def _replayed(reply: zenoh.Reply) -> Sample | None:

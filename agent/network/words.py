@@ -9,18 +9,22 @@ import math
 import time
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from agent.contract.errors import InputError
 from agent.contract.messages import Acknowledged, Control, Facts, Joining, Leaving, Ready, Stamp
 
 
 class Sample(NamedTuple):
-    """A data message as it came in. `stamp` is None where the sender left it out."""
+    """A data message as it came in. `stamp` is None where the sender left it out.
+
+    `trace` is Zenoh's record of when it was where; see `session.way_of`.
+    """
 
     topic: str
     payload: bytes
     stamp: Stamp | None
+    trace: Any = None
 
 
 class Peer(NamedTuple):

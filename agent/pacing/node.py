@@ -20,7 +20,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import NodeGains
 from agent.contract.keys import estimate, measurement, node_who
-from agent.contract.messages import ZERO_STATE, Account, Estimate, Event, Measurement, Message, Mode
+from agent.contract.messages import ZERO_STATE, Account, Estimate, Event, Measurement, Message, Mode, Way
 from agent.estimates import told
 from agent.filter import Pair, innovation, step
 from agent.inbox import Inbox
@@ -36,6 +36,7 @@ class _Arrived(NamedTuple):
     sender: str
     message: Message
     at: float
+    way: Callable[[], Way | None]
 
 
 class PacedNode:
@@ -71,9 +72,9 @@ class PacedNode:
         self._told_at: tuple[int, float] | None = None  # steps made, and when: of its last account, or the beginning
         self.done = False
 
-    def take(self, sender: str, message: Message, at: float) -> None:
-        """Take in what arrived at `at`; `sender` is the node that an estimate is from."""
-        arrived = _Arrived(sender, message, at)
+    def take(self, sender: str, message: Message, at: float, way: Callable[[], Way | None] = lambda: None) -> None:
+        """Take in what arrived at `at`; `sender` is the node that an estimate is from, `way` asked where it is late."""
+        arrived = _Arrived(sender, message, at, way)
         if isinstance(message, Mode):
             self._told_at = self._told_at or (0, at)
             if self._k <= message.step < self._steps:
@@ -82,7 +83,7 @@ class PacedNode:
         topic = self._measurement if isinstance(message, Measurement) else estimate(sender)
         told_already = message.step == self._k and topic == self._measurement and self._sent is not None
         if message.step < self._k or told_already:
-            self._late += self._reasons.came(message.step, topic, at)
+            self._late += self._reasons.came(message.step, topic, at, way)
         elif message.step < self._k + LARGEST_WINDOW:
             self._there[message.step].setdefault(topic, arrived)
 
@@ -161,7 +162,7 @@ class PacedNode:
         is_gone = arrived is None and not self._is_there(topic)
         self._reasons.missed(self._k, topic, deadline=deadline, gone=is_gone)
         if arrived is not None:
-            self._late += self._reasons.came(self._k, topic, arrived.at)
+            self._late += self._reasons.came(self._k, topic, arrived.at, arrived.way)
         return False
 
     def _measure(self, x_hat: Array) -> Estimate:

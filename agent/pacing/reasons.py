@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from agent.contract.messages import GONE, LATE, SILENT, Event
+from agent.contract.messages import GONE, LATE, SILENT, Event, Way
 
 TELL_SECONDS = 0.5  # a reason waits for others to go with it for so long
 AT_MOST = 64  # reasons in one event
@@ -23,6 +23,7 @@ class _Told(NamedTuple):
     since: float
     steps: list[int]
     seconds: list[float]
+    ways: list[Way | None]
 
 
 class Reasons:
@@ -44,12 +45,12 @@ class Reasons:
         else:
             self._open[_Missed(step, topic)] = deadline
 
-    def came(self, step: int, topic: str, at: float) -> bool:
-        """A message came after its step: whether it had been waited for."""
+    def came(self, step: int, topic: str, at: float, way: Callable[[], Way | None] = lambda: None) -> bool:
+        """A message came after its step: whether it had been waited for. `way` says where it spent its time."""
         deadline = self._open.pop(_Missed(step, topic), None)
         if deadline is None:
             return False
-        self._tell(LATE, topic, step, at - deadline, at)
+        self._tell(LATE, topic, step, at - deadline, at, way())
         return True
 
     @property
@@ -69,14 +70,18 @@ class Reasons:
                 del self._told[kind, topic]
                 yield self._event(kind, topic, told, step)
 
-    def _tell(self, kind: str, topic: str, step: int, seconds: float, now: float) -> None:
-        told = self._told.setdefault((kind, topic), _Told(now, [], []))
+    def _tell(self, kind: str, topic: str, step: int, seconds: float, now: float, way: Way | None = None) -> None:
+        told = self._told.setdefault((kind, topic), _Told(now, [], [], []))
         told.steps.append(step)
         told.seconds.append(seconds)
+        told.ways.append(way)
 
     def _event(self, kind: str, topic: str, told: _Told, step: int) -> Event:
         steps = f"step {told.steps[0]}" if len(told.steps) == 1 else f"{len(told.steps)} steps from {told.steps[0]}"
         by = f" by up to {1e3 * max(told.seconds):.3g} ms" if kind == LATE else ""
+        way = told.ways[told.seconds.index(max(told.seconds))]
+        if way is not None:
+            by += f" ({1e3 * sum(way):.3g} ms on its way)"
         return Event(
             step=step,
             kind=kind,
@@ -85,4 +90,5 @@ class Reasons:
             about=topic,
             steps=told.steps,
             seconds=told.seconds if kind == LATE else [],
+            way=list(way) if way is not None else [],
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import count
 
 import numpy as np
@@ -12,13 +13,13 @@ import numpy as np
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
 from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT, decode, estimate, measurement, node_who, sensor_who
-from agent.contract.messages import Account, Control, Estimate, Message, Mode
+from agent.contract.messages import Account, Control, Estimate, Message, Mode, Way
 from agent.contract.schedule import Deliveries
 from agent.estimates import told
 from agent.faults import Arriving, Ordeal, parse
 from agent.filter import Pair, innovation, step
 from agent.inbox import Inbox
-from agent.network.arrivals import Arrivals
+from agent.network.arrivals import Arrival, Arrivals
 from agent.network.bus import Bus
 from agent.network.session import Channel
 from agent.network.words import Sample
@@ -48,6 +49,7 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
         if not start.period:
             _in_lock_step(bus, own, lost, modes, measurements, estimates)
             return
+        bus.trace()
         sensor = sensor_who(node) if node in start.external else PLANT
         paced = PacedNode(
             own,
@@ -100,11 +102,11 @@ def _against_the_clock(
 ) -> None:
     """Steps as they are due, until all are made or a channel closes."""
     while not paced.done:
-        for sample, at in arrivals.until(paced.wake):
-            sender, message = _decoded(sample)
-            at += arriving.delay(sample.topic, message.step)
-            if at < math.inf:
-                paced.take(sender, message, at)
+        for arrival in arrivals.until(paced.wake):
+            sender, message = _decoded(arrival.sample)
+            delay = arriving.delay(arrival.sample.topic, message.step)
+            if delay < math.inf:
+                paced.take(sender, message, arrival.at + delay, partial(_way, arrival, delay))
             if isinstance(message, Mode):
                 suffer(ordeal.due(message.step))
                 bus.step = max(bus.step, message.step + 1)
@@ -116,6 +118,12 @@ def _against_the_clock(
                 paced.published(message, time.monotonic())
         except ValueError as error:
             raise RunBroken(f"a message to node {node} cannot be used: {error}") from None
+
+
+def _way(arrival: Arrival, delay: float) -> Way | None:
+    """Where a message spent its time; a delay that a fault asks for is one of the wire."""
+    way = arrival.way()
+    return None if way is None else way._replace(wire=way.wire + delay)
 
 
 def _topic_of(message: Message, node: str) -> str:

@@ -31,6 +31,8 @@ def run(bus: Bus, gains: Gains) -> None:
         plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case)
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         ordeal = Ordeal(faults, PLANT, begin=start.step)
+        if start.period:
+            bus.trace()
         while True:
             step = decode(MODE, modes.next().payload).step
             if start.period:

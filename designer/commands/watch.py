@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from agent.commands.looking import add_looker, look_on
 from agent.commands.options import Subcommands, load_gains
-from agent.contract.errors import EXIT_GOOD, InputError, RunBroken
+from agent.contract.errors import EXIT_GOOD, InputError, Interrupted, RunBroken
 
 if TYPE_CHECKING:
     from agent.commands.looking import Onlooker
@@ -80,9 +80,13 @@ def _take_in(onlooker: Onlooker, scene: Scene, deadline: float, digest: str) -> 
 
     for sample, at in onlooker.until(deadline):
         try:
-            scene.hear(sample.topic, decode(sample.topic, sample.payload), at)
+            message = decode(sample.topic, sample.payload)
+        except Interrupted:
+            raise
         except RunBroken:  # somebody says what is no message
             scene.unreadable += 1
+        else:
+            scene.hear(sample.topic, message, at)
     onlooker.heed()
     scene.present(onlooker.present)
     if scene.gains is None and onlooker.facts is not None:

@@ -26,6 +26,7 @@ from designer.ledger.promise import Promise
 
 LAG = 2  # steps by which a mode must be ahead: what is on its way of somebody who is gone has come by then
 PATIENCE = 2.0  # seconds after which a node that says nothing counts as absent, though it has not gone
+BACKLOG = 500  # steps that wait to be settled, at most: of a large network one with a fault may take seconds
 LOOKS = 4  # promises that are worked out each time, at most, where faults begin and end
 
 
@@ -104,6 +105,15 @@ class Book:
                 self._look()
         if settled:
             self._look()
+        self._catch_up(waited_for)
+
+    def _catch_up(self, waited_for: list[int]) -> None:
+        """Where too many steps wait, leave them out, and begin anew after them."""
+        last = min([self._tick - LAG, *(self._newest[i] - 1 for i in waited_for)])
+        if last - self._next > BACKLOG:
+            self._lose()
+            self._next = last
+            self._drop(last)
 
     # when
     def _may_begin(self, waited_for: list[int]) -> bool:

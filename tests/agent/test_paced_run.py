@@ -167,6 +167,9 @@ def test_several_faults_at_once(gains_path: Path, tmp_path: Path) -> None:
     assert verdict.pacing.measurements_substituted > 0
     assert verdict.pacing.unexplained_total == 0
     assert {"late", "silent"} <= verdict.pacing.reasons.keys()
+    for event in events(tmp_path / "run.mcap", "late"):
+        if event.about.endswith("estimate") and event.steps[event.seconds.index(max(event.seconds))] in range(8, 21):
+            assert event.way[1] > 0.089  # on the wire
 
 
 def test_every_node_with_a_sensor_needs_no_plant(gains_path: Path, tmp_path: Path, gains: Gains) -> None:

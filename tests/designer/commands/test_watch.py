@@ -10,18 +10,24 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 from here import here
 from places import GOLDEN
 from roles import Roles
-from runs import MANY, answer, decoded, end_of, line_with, logged, peakmesh, program, started
+from runs import MANY, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
 
+from agent.contract.errors import Interrupted
 from agent.contract.gains import Gains
 from agent.contract.messages import Estimate, PlantState
+from agent.network.arrivals import Arrival
+from agent.network.words import Sample
+from agent.plan import Pace
+from designer.commands.watch import _take_in
 from designer.replay import replay
+from designer.watch.scene import Scene
 
 GAINS = GOLDEN / "zhu2020-lossy.gains.json"
 NAMES = Gains.load(GAINS).problem.node_names
@@ -134,6 +140,57 @@ def what_was_shown_is_what_was_recorded(recording: Path, states: list[State]) ->
                 assert seen["error"] == pytest.approx(error, rel=1e-12)
                 compared += 1
     assert compared >= len(NAMES)
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_of_a_run_on_one_machine_everybody_is_seen(tmp_path: Path) -> None:
+    """Nobody knows their sockets but by gossip."""
+    addresses, states = list[str](), list[State]()
+
+    def heed(word: State) -> None:
+        addresses.extend(word.get("listening", []))
+
+    def look() -> None:
+        with started("watch", "--connect", addresses[0], "--json") as watch:
+            states.extend(until(watch, is_complete))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        run_here(GAINS, tmp_path / "run.mcap", at=5, do=look, heed=heed, pace=Pace(0.1))
+    assert [node["name"] for node in states[-1]["nodes"] if node["there"]] == list(NAMES)
+    assert all(node["error"] is not None for node in states[-1]["nodes"])
+    assert replay(tmp_path / "run.mcap").agrees
+
+
+class Silent:
+    """Somebody who looks on, and hears one message."""
+
+    facts, present = None, frozenset[str]()
+
+    def __init__(self, topic: str, payload: bytes) -> None:
+        self._arrival = Arrival(Sample(topic, payload, None), 0.0)
+
+    def until(self, deadline: float) -> Iterator[Arrival]:
+        yield self._arrival
+
+    def heed(self) -> None:
+        return
+
+
+@pytest.mark.parametrize("topic", ["mode", "nonsense", "event"])
+def test_what_is_no_message_is_counted_and_stops_nothing(topic: str) -> None:
+    scene = Scene("a-run")
+    _take_in(Silent(topic, b"nonsense"), scene, 0.0, "")  # type: ignore[arg-type]
+    assert scene.seen().unreadable == 1
+
+
+def test_a_signal_that_comes_while_a_message_is_read_is_heeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def signalled(topic: str, payload: bytes) -> NoReturn:
+        raise Interrupted(signal.SIGHUP)
+
+    monkeypatch.setattr("agent.contract.keys.decode", signalled)
+    with pytest.raises(Interrupted):
+        _take_in(Silent("mode", b"{}"), Scene("a-run"), 0.0, "")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("words", [["--run", "a/b"], ["--connect", "7447"], []])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -224,18 +224,32 @@ def test_a_transition_that_the_chain_does_not_have_makes_it_void() -> None:
     assert said[30].reason == f'the chain never goes from mode "{before}" to "{other}"'
 
 
-def test_it_stops_when_it_is_enough_and_goes_on_later() -> None:
-    messages = PacedRun(GAINS, steps=STEPS, seed=SEED).messages
-    start = facts()
-    book = Book(GAINS, start, Asked(GAINS.problem, seed=start.seed))
-    for sent in messages:
+def full() -> Book:
+    """One that has heard a whole run, and settled nothing."""
+    book = Book(GAINS, facts(), Asked(GAINS.problem, seed=SEED))
+    for sent in PacedRun(GAINS, steps=STEPS, seed=SEED).messages:
         message = read(sent)
         if isinstance(message, Mode):
             book.mode(message.step, message.mode)
         elif isinstance(message, Estimate):
             book.estimate(sent.topic.split("/")[1], message)
-    enough: Callable[[], bool] = iter([False] * 5 + [True]).__next__
-    book.settle(NAMES, enough)
+    return book
+
+
+def test_it_stops_when_it_is_enough_and_goes_on_later() -> None:
+    book = full()
+    book.settle(NAMES, iter([False] * 5 + [True]).__next__)
     assert book.at == 4
     book.settle(NAMES)
-    assert book.at == STEPS - 1 - LAG
+    assert (book.at, book.since) == (STEPS - 1 - LAG, 0)
+
+
+def test_what_it_is_too_slow_for_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So what waits is bounded; and it says from where on it has seen all."""
+    monkeypatch.setattr(module, "BACKLOG", 20)
+    book = full()
+    book.settle(NAMES, iter([False] * 5 + [True]).__next__)
+    assert book.promise is None
+    assert max(len(told) for told in book._told) <= LAG + 1
+    book.settle(NAMES)
+    assert book.since == book.at == STEPS - 1 - LAG
