@@ -144,6 +144,9 @@ class Door:
             del self._asked[number]
             self._hand_over_open(lambda: Replayed(who))
 
+    def answer(self, topic: str, payload: bytes) -> None:
+        """No viewer is there to ask."""
+
     # words
     def listen(self, topic: str, decode: Callable[[bytes], Incoming]) -> None:
         self._subscribe(topic, lambda at, payload: self._hand_over_open(lambda: decode(payload)))  # type: ignore[arg-type]
