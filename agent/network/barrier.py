@@ -115,7 +115,7 @@ class Barrier:
                 raise RunClosed(word)
             case Control(step=step) if kind is not Control and step:
                 raise UnderWay(word)
-            case Ready(underway=True):
+            case Ready(underway=True) if self._who == COORDINATOR:  # the recorder hears it, too
                 raise Orphaned(word)
             case Namesake(identity=identity):
                 self._heed_namesake(identity)

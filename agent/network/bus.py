@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import suppress
 from importlib.metadata import version
 from threading import Thread
 from types import FrameType, TracebackType
-from typing import NoReturn, Self, TypeVar
+from typing import Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -92,10 +93,12 @@ class Bus:
         self.run, self.who, self.network = run, who, network
         self._words = Words(who)
         self._outbox = Outbox(who)
+        self._unanswered: Counter[str] = Counter()  # requests for replay, by whom they were made to
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._ready: Ready | None = None  # what we have told the coordinator
         self.has_begun = False  # the run, for us
+        self.is_late = False  # joined while the run went on
         self.patient = False  # in a paced run: a coordinator that is lost may come back
         self._given_up = math.inf  # when it is not waited for any more
         self.step = 0  # of a paced run: the first of which we have had no mode
@@ -174,7 +177,7 @@ class Bus:
             self._listen(CONTROL, Control)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
-        self._session.listen(refused(self.who, self._session.identity), _refuse)
+        self._session.listen(refused(self.who, self._session.identity), self._refuse)
         self._session.watch()
         self._session.watch_namesakes(self.who)
         self._session.appear(self.who)
@@ -187,6 +190,11 @@ class Bus:
             self._session.say(refused(self.who, identity), sentence.encode())
         elif identity < own:
             raise Refused(sentence)
+
+    def _refuse(self, sentence: bytes) -> None:
+        """Our place is taken, says a namesake. Where that one has joined our run unseen, it is theirs to go."""
+        if not self.has_begun or self.is_late:
+            raise Refused(sentence.decode(errors="replace"))
 
     def _listen(self, topic: str, model: type[Word], *, heed: Callable[[Word], None] = lambda word: None) -> None:
         def decode(payload: bytes) -> Word:
@@ -279,7 +287,7 @@ class Bus:
         """
         deadline = time.monotonic() + timeout
         while True:
-            word = self._words.next(min(deadline, self._given_up))
+            word = self._noted(self._words.next(min(deadline, self._given_up)))
             if time.monotonic() >= self._given_up:
                 raise RunBroken(f"the coordinator was lost, and did not come back within {self.network.wait:g} s")
             match word:
@@ -312,6 +320,11 @@ class Bus:
         """Have the main thread raise `error`; called by the thread that computes."""
         self._words.put(lambda: _raise(error))
 
+    @property
+    def unrecorded(self) -> int:
+        """How many of our messages the recorder has not got, as far as it has said."""
+        return len(self._outbox)
+
     def order(self, control: Control) -> None:
         """The coordinator's word to everybody."""
         self.has_begun = self.has_begun or control.order == "start"
@@ -327,6 +340,7 @@ class Bus:
 
     def request_replay(self, who: str, *, first: int) -> None:
         """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
+        self._unanswered[who] += 1
         self._session.request_replay(who, first=first, seconds=CLOSE_SECONDS)
 
     def _say(self, topic: str, word: BaseModel) -> None:
@@ -334,21 +348,30 @@ class Bus:
 
     # End together.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
-        """Samples that are still to come, until everybody in `whos` has answered a request for replay."""
-        waiting = set(whos)
-        for word in self._until(lambda: not waiting, silence=REPLAY_SECONDS):
-            match word:
-                case Sample() as sample:
-                    yield sample
-                case Replayed(who=who):
-                    waiting.discard(who)
+        """Samples that are still to come, until everybody in `whos` has answered every request for replay.
+
+        Every one: what answers an earlier request may have left before what the last one is about was published.
+        """
+        names = list(whos)
+        for word in self._until(lambda: not any(self._unanswered[who] for who in names), silence=REPLAY_SECONDS):
+            if isinstance(word, Sample):
+                yield word
 
     def wait_for_close(self) -> Acknowledged | None:
-        """Answer replays until the recorder has closed the recording; None where it has not."""
-        present = self._words.present
-        for _ in self._until(lambda: self._last_word is not None or RECORDER not in present, silence=CLOSE_SECONDS):
+        """Answer replays until the recorder has closed the recording; None where it has not.
+
+        In a paced run the recorder may just be on its way back; the coordinator, whose end it is, knows.
+        """
+        keepers, present = {RECORDER, COORDINATOR} if self.patient else {RECORDER}, self._words.present
+        for _ in self._until(lambda: self._last_word is not None or not keepers & present, silence=CLOSE_SECONDS):
             pass
         return self._last_word
+
+    def wait_until_there(self, whos: Iterable[str]) -> None:
+        """Wait for those who have not been seen yet; but not for long, for they may be gone."""
+        names, present = set(whos), self._words.present
+        for _ in self._until(lambda: names <= present, silence=GREET_SECONDS):
+            pass
 
     def wait_until_gone(self, whos: Iterable[str], *, greet: Callable[[], None] = lambda: None) -> None:
         """Stay until they have gone, so that our last word is sure to have reached them; but not for long.
@@ -365,10 +388,15 @@ class Bus:
         self._leaving = True
         while not condition():
             before = self._words.taken
-            word = self._words.take(time.monotonic() + silence)
+            word = self._noted(self._words.take(time.monotonic() + silence))
             if self._words.taken == before:
                 return
             yield word
+
+    def _noted(self, word: Incoming | None) -> Incoming | None:
+        if isinstance(word, Replayed):
+            self._unanswered[word.who] -= 1
+        return word
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._words.put(lambda: self._interrupt(number))
@@ -376,10 +404,6 @@ class Bus:
     def _interrupt(self, number: int) -> None:
         if not self._leaving:
             raise Interrupted(number)
-
-
-def _refuse(sentence: bytes) -> NoReturn:
-    raise Refused(sentence.decode(errors="replace"))
 
 
 def _raise(error: BaseException) -> None:

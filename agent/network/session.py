@@ -169,7 +169,7 @@ class Session:
         self._declared.append(liveliness.declare_subscriber(key("*", alive(COORDINATOR)), see, history=True))
 
     # Words that run the run.
-    def listen(self, topic: str, decode: Callable[[bytes], Incoming]) -> None:
+    def listen(self, topic: str, decode: Callable[[bytes], Incoming | None]) -> None:
         """Have every word on `topic` decoded."""
 
         def hear(sample: zenoh.Sample) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import version
 
-from agent.contract.errors import InputError, RecordingFailed, RunBroken
+from agent.contract.errors import InputError, RecordingFailed, RunBroken, counted
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words
 from agent.contract.messages import Control
@@ -23,13 +23,14 @@ def join(bus: Bus, gains: Gains) -> Control:
     bus.enter()
     try:
         start = _met(bus, gains)
-        bus.has_begun = True
+        bus.has_begun, bus.is_late = True, start.step > 0
         bus.patient, bus.identity = start.period > 0.0, start.identity
         if start.step and bus.who != RECORDER:
             bus.greeted()
         return start
     except RunClosed as closed:
-        raise RunBroken(closed.control.reason) from None
+        late = f"the run had ended before {in_words(bus.who)} could join it"
+        raise RunBroken(closed.control.reason or late) from None
 
 
 def _met(bus: Bus, gains: Gains) -> Control:
@@ -79,3 +80,5 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
             raise RunBroken("the recorder did not say that the recording is closed; it may lack messages") from None
         if last_word.broken_off is not None:
             raise RecordingFailed(f"the run has ended, but {last_word.broken_off}") from None
+        if bus.unrecorded:
+            raise RunBroken(f"the recording was closed without {counted(bus.unrecorded, 'message')} of ours") from None

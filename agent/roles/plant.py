@@ -34,16 +34,21 @@ def run(bus: Bus, gains: Gains) -> None:
         if start.period:
             bus.trace()
         while True:
-            step = decode(MODE, modes.next().payload).step
+            step = first = decode(MODE, modes.next().payload).step
             if start.period:
+                if step < plant.step:
+                    continue  # a coordinator that has come back gives out again what the recorder has not got
                 suffer(ordeal.due(step))
-                plant.skip_to(step)
+                if plant.step or not start.step:
+                    first = plant.step  # whose mode may have gone with the coordinator: late is better than never
+                plant.skip_to(first)
                 bus.step = step + 1
-            state, measurements = plant.advance(step)
-            for name, y in measurements.items():
-                if name not in start.external:
-                    bus.publish(measurement(name), y)
-            bus.publish(PLANT_STATE, state)
+            for k in range(first, step + 1):
+                state, measurements = plant.advance(k)
+                for name, y in measurements.items():
+                    if name not in start.external:
+                        bus.publish(measurement(name), y)
+                bus.publish(PLANT_STATE, state)
 
     take_part(bus, gains, work)
 
@@ -56,17 +61,17 @@ class SimulatedPlant:
         self._losses = Losses(problem, seed=seed)
         self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=worst_case)
         self._x = np.zeros(problem.nx)
-        self._step = 0
+        self.step = 0  # the next one
 
     def skip_to(self, step: int) -> None:
         """Let the steps before `step` pass, of which no mode came: the plant goes on, seen or not."""
-        while self._step < step:
-            self.advance(self._step)
+        while self.step < step:
+            self.advance(self.step)
 
     def advance(self, step: int) -> tuple[PlantState, dict[str, Measurement]]:
         """The messages of step `step`; the steps must be asked for one after the other, or RunBroken is raised."""
-        if step != self._step:
-            raise RunBroken(f"the mode of step {step} came where that of step {self._step} was due")
+        if step != self.step:
+            raise RunBroken(f"the mode of step {step} came where that of step {self.step} was due")
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._advance(step)
@@ -88,7 +93,7 @@ class SimulatedPlant:
             for node, theta_i in zip(self._problem.nodes, theta, strict=True)
         }
         self._x = product(plant.A, x) + product(plant.B, w)
-        self._step += 1
+        self.step += 1
         return state, measurements
 
 

@@ -24,7 +24,7 @@ from agent.contract.recording.writer import Split
 from agent.faults import Ordeal, parse
 from agent.network.bus import Bus
 from agent.network.session import Channel
-from agent.network.words import RunClosed, Sample
+from agent.network.words import Peer, RunClosed, Sample
 from agent.plan import RecordingPlan
 from agent.roles.joining import join
 from agent.roles.record import Record
@@ -60,7 +60,14 @@ def run(
         faults = [parse(text, gains.problem, steps=start.steps) for text in start.faults]
         ordeal = Ordeal(faults, RECORDER, begin=start.step) if paced else None
         recorder = Recorder(
-            bus, channels, record, window=start.window, goes_on=plan.goes_on, report=report, ordeal=ordeal
+            bus,
+            channels,
+            record,
+            window=start.window,
+            goes_on=plan.goes_on,
+            report=report,
+            ordeal=ordeal,
+            is_late=bus.is_late,
         )
         try:
             recorder.record()
@@ -72,7 +79,8 @@ def run(
             if recorder.broken_off is not None:
                 raise RecordingFailed(f"the run has ended, but {recorder.broken_off}") from None
         except (RunBroken, Interrupted) as error:
-            recorder.close(status="broken", reason=str(error))
+            if not (paced and isinstance(error, Interrupted)):  # a recorder after this one goes on with the file
+                recorder.close(status="broken", reason=str(error))
             raise
 
 
@@ -89,13 +97,16 @@ class Recorder:
         goes_on: bool,
         report: Callable[[BrokenOff], None],
         ordeal: Ordeal | None = None,
+        is_late: bool = False,
     ) -> None:
-        """`ordeal` is what a paced run has its recorder suffer; None in lock-step."""
+        """`ordeal` is what a paced run has its recorder suffer; None in lock-step. `is_late`: it joined under way."""
+        self._is_late = is_late
         self._ordeal, self._told = ordeal, 0.0
         self._bus, self._channels, self._record = bus, channels, record
         self._goes_on, self._report = goes_on, report
         self._publishers = sorted({sender_of(topic) for topic in channels})
         self._quantum = max(1, window // 4)  # steps between acknowledgements
+        self._sessions: dict[str, str] = {}  # of those who are there: a namesake shall not go on with their numbers
         self._acknowledged = 0
         self._closing = False
         self._quiet_since = time.monotonic()
@@ -113,8 +124,11 @@ class Recorder:
             match word:
                 case Sample():  # a replay that we asked for
                     self._take(word)
-                case Ready(asks=True, who=who) if who in self._publishers:
-                    self._greet(who)
+                case Ready(who=who, session=session, asks=asks) if who in self._publishers:
+                    if self._sessions.setdefault(who, session) == session and asks:
+                        self._greet(who)
+                case Peer(who=who, present=False):
+                    self._sessions.pop(who, None)
             pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
@@ -123,6 +137,8 @@ class Recorder:
         """Ask everybody for what is missing, end the file, and let everybody go."""
         self._closing = True
         self._take_waiting()
+        if self._is_late:
+            self._bus.wait_until_there(self._publishers)
         self._ask_everybody()
         for sample in self._bus.replayed(self._publishers):
             self._take(sample)

@@ -169,13 +169,16 @@ class Coupling:
         nodes = np.flatnonzero(log.origin[k] != -1)
         if not len(nodes):
             return None
-        jump = np.eye(size)
-        for i in nodes:
-            rows, origin = slice(p + i * nx, p + (i + 1) * nx), int(log.origin[k, i])
+        jump, n = np.eye(size), log.gains.problem.n
+        left = {int(i): int(log.origin[k, i]) for i in nodes}
+        while left:  # first those whose origin does not begin itself in this step
+            i = next((i for i, origin in left.items() if origin not in left), next(iter(left)))
+            rows, origin = slice(p + i * nx, p + (i + 1) * nx), left.pop(i)
+            if 0 <= origin < n:
+                jump[rows] = jump[p + origin * nx : p + (origin + 1) * nx]
+                continue
             jump[rows] = 0.0
-            if 0 <= origin < log.gains.problem.n:
-                jump[rows, p + origin * nx : p + (origin + 1) * nx] = np.eye(nx)
-            elif p:
+            if p:
                 jump[rows, :p] = np.eye(nx)
         return jump
 
@@ -185,7 +188,7 @@ class Coupling:
         found = np.empty((now.stop - now.start, central.model.size))
         for s in np.unique(inputs.mode[now]):
             at = inputs.mode[now] == s
-            w, y = inputs.w[now][at], log.y[now][at]
+            w, y = inputs.w[now][at], np.where(np.isnan(log.y[now]), inputs.u[now], log.y[now])[at]
             found[at] = central.magnitude(int(s), x[at], x_hat[at], w, y, stand_in=self._stand_in[s])
         return found
 
@@ -211,7 +214,7 @@ def with_the_plant(log: Log, drawn: Drawn) -> Log:
 
 
 def _absent(log: Log) -> Flags:
-    unknown = np.isnan(log.x_hat.reshape(log.steps, log.gains.problem.n, -1))
+    unknown = np.isnan(log.x_hat.reshape(log.steps, log.gains.problem.n, log.gains.problem.nx))
     return np.asarray(unknown.any(axis=2), dtype=np.bool_)
 
 

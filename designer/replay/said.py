@@ -24,6 +24,7 @@ class Said:
         self.memory = memory  # steps of which a process that is killed may not have given its reasons yet
         self.pairs: set[tuple[int, int, int]] = set()  # (step, receiver, sender): it was substituted
         self.measurements: set[tuple[int, int]] = set()  # (step, node)
+        self.unheard: set[tuple[int, int]] = set()  # (step, node): its measurement never came
         self.began: set[tuple[int, int]] = set()  # (step, node): it began again
         self.gone: dict[str, list[int]] = {}  # of a participant, about when it went
         self.kinds: Counter[str] = Counter()  # why messages were substituted
@@ -60,13 +61,16 @@ class Said:
                 self.pairs |= {(step, i, j) for step in event.steps}
             elif self._measurements.get(event.about) == i:
                 self.measurements |= {(step, i) for step in event.steps}
+                self.unheard |= {(step, i) for step in event.steps if event.kind != LATE}
 
 
 def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external: tuple[bool, ...], steps: int) -> Flags:
     """(steps, topics): which messages are not there because nobody was there to send them.
 
     A node that begins again says so; for the plant, and for a node that never came back, the coordinator has said
-    that it was gone. A sensor's measurement may be missing wherever its node says that it had none.
+    that it was gone, or, where it was gone itself, the nodes that they heard nothing of it. A node to which the last
+    modes did not come has not given its last account. A sensor's measurement may be missing wherever its node says that
+    it had none.
     """
     has = columns["has"][:steps]
     found = np.zeros_like(has)
@@ -74,14 +78,28 @@ def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external:
         place, told, origin = 2 + 2 * i, columns["told"][:steps, i], columns["origin"][:steps, i]
         for first, end in _gaps(has[:, place]):
             comes_back = end < len(has) and origin[end] != -1
-            found[first:end, place] = comes_back or _went(said.gone.get(who, []), first, end)
+            waited = end == len(has) and said.accounted(i) < first  # for modes that did not come, to the end
+            found[first:end, place] = comes_back or waited or _went(said.gone.get(who, []), first, end)
         if external[i]:
             found[:, place + 1] = ~has[:, place] | (told == 0)
     simulated = [topic for topic in topics.values() if topic.who == PLANT or topic.topic == PLANT_STATE]
     for topic in simulated:
         for first, end in _gaps(has[:, topic.place]):
             found[first:end, topic.place] = _went(said.gone.get(PLANT, []), first, end)
+            found[_broken_off(has, said), topic.place] = True
     return found
+
+
+def _broken_off(has: Flags, said: Said) -> Flags:
+    """(steps,): at which the plant's state is not there, nor some measurements, and their nodes say they never came."""
+    unheard = np.zeros((len(has), len(said._nodes)), dtype=bool)
+    for step, i in said.unheard:
+        if step < len(has):
+            unheard[step, i] = True
+    estimates = 2 + 2 * np.arange(len(said._nodes))
+    unheard &= ~has[:, estimates + 1]
+    explained = unheard | has[:, estimates + 1] | ~has[:, estimates]
+    return np.asarray(unheard.any(axis=1) & explained.all(axis=1) & ~has[:, 1])
 
 
 def _went(steps: list[int], first: int, end: int) -> bool:

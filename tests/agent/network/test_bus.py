@@ -145,6 +145,7 @@ def test_whoever_asks_for_a_replay_gives_up_in_silence_alone(
         recorder._words.taken += 1
         return words.pop(0)
 
+    recorder.request_replay(COORDINATOR, first=0)
     monkeypatch.setattr(bus, "time", SimpleNamespace(monotonic=lambda: now))
     monkeypatch.setattr(recorder._words, "take", take)
     found = list(recorder.replayed([COORDINATOR]))

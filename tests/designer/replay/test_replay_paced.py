@@ -131,6 +131,57 @@ def test_a_run_without_faults_has_none(tmp_path: Path) -> None:
     assert "0 of " in verdict.text()
 
 
+def test_a_node_may_begin_with_what_another_has_just_begun_with(tmp_path: Path) -> None:
+    """Both have missed a tick; the one begins with 0, the other, which hears it in time, with that."""
+    problem = HIDDEN.problem
+    two = next(
+        (problem.node_names[i], problem.node_names[j])
+        for i in range(problem.n)
+        for j in problem.ever_heard(i)
+        if i != j
+    )
+
+    def delay(receiver: str, topic: str, step: int) -> float:
+        if topic == "mode" and receiver in two and step % 5 == 4:
+            return math.inf
+        return SOON + (0.5 * PACE.period if topic == "mode" and receiver == two[0] and not step % 5 else 0.0)
+
+    sent = PacedRun(HIDDEN, steps=STEPS, delay=delay).messages
+    begun = {(m.who, m.document["step"]): m.document["origin"] for m in sent if m.document.get("origin")}
+    assert any(origin == two[1] and (f"node-{two[1]}", step) in begun for (_, step), origin in begun.items())
+    verdict = verdict_of(tmp_path, sent)
+    assert verdict.exit_code == 0, verdict.text()
+
+
+@pytest.mark.parametrize("gains", [HIDDEN, REAL, SEEN], ids=["hidden", "real", "seen"])
+def test_rounding_is_measured_where_nothing_of_the_plant_came(tmp_path: Path, gains: Gains) -> None:
+    """By what the nodes made of what they had: the plant has told them, and the recorder was not there."""
+    sent = [m for m in faulty(gains, **FAULTS["late"]) if m.who != "plant"]
+    verdict = verdict_of(tmp_path, sent, gains)
+    assert verdict.first_divergence is None, verdict.text()
+
+
+def test_a_recording_without_a_step_is_no_error(tmp_path: Path) -> None:
+    verdict = verdict_of(tmp_path, [m for m in TRUE if m.topic == "event"][:1])
+    assert verdict.exit_code == 3
+    assert verdict.first_divergence is None
+
+
+@pytest.mark.parametrize("there", [0, 2, len(HIDDEN.problem.nodes)], ids=["nothing", "some", "all but its state"])
+def test_nodes_may_say_alone_that_the_plant_was_gone(tmp_path: Path, there: int) -> None:
+    """Where it was gone with the coordinator, between two of its messages too; what all have had cannot be gone."""
+    names = [*HIDDEN.problem.node_names][there:]
+    lost = {"plant/state", *(f"node/{name}/measurement" for name in names)}
+
+    def delay(receiver: str, topic: str, step: int) -> float:
+        return math.inf if topic in lost and step == 20 else SOON
+
+    sent = PacedRun(HIDDEN, steps=STEPS, delay=delay).messages
+    gone = [m for m in sent if not (m.topic in lost and m.document["step"] == 20)]
+    verdict = verdict_of(tmp_path, gone)
+    assert verdict.exit_code == (0 if names else 1), verdict.text()
+
+
 def by_sensors(sent: list[Sent]) -> list[Sent]:
     """The same without a plant: every measurement is from a sensor."""
     return [
