@@ -32,7 +32,8 @@ def test_both_examples_are_there() -> None:
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
 def test_every_message_is_what_its_schema_says(path: Path) -> None:
     found = read(path)
-    assert len(found) == 602
+    assert len([topic for topic, _, _ in found if topic != "evidence"]) == 602
+    assert len(found) > 602  # evidence is told as time goes by
     for schema in {json.dumps(schema): schema for _, schema, _ in found}.values():
         Draft202012Validator.check_schema(schema)
     for topic, schema, message in found:
