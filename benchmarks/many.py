@@ -98,8 +98,7 @@ def print_use(watcher: Watcher, rate: float) -> None:
     first, last = watcher.first[RECORDER], watcher.last[RECORDER]
     if last.at > first.at:
         busy = (last.processor - first.processor) / (last.at - first.at)
-        sockets = max(first.sockets, last.sockets)  # it may be about to leave
-        print(f"    recorder: {last.resident:.0f} MB, {sockets} sockets, {busy:.0%} of a processor", end="")
+        print(f"    recorder: {last.resident:.0f} MB, {last.sockets} sockets, {busy:.0%} of a processor", end="")
         print(f" for {rate:.0f} messages/s")
 
 
@@ -144,7 +143,7 @@ class Watcher(threading.Thread):
                         who, use = role(pid), Use(pid)
                     except OSError:  # it has ended
                         continue
-                    self.first.setdefault(who, use)
+                    use.sockets = max(use.sockets, self.first.setdefault(who, use).sockets)  # who leaves has fewer
                     self.last[who] = use
 
 
