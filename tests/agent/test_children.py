@@ -36,6 +36,7 @@ def test_children_tell_how_they_end(nursery: Nursery, lone_path: Path) -> None:
     misused = nursery.start(["plant"], wants_output=False)
     killed, stopped = waiting(nursery, lone_path), waiting(nursery, lone_path)
     assert Path(f"/proc/{killed.pid}/cmdline").read_text().startswith(f"peakmesh coordinator {lone_path}")
+    assert len(list(Path(f"/proc/{nursery._process.pid}/task").iterdir())) == 1  # what forks has no other thread
     nursery.kill(killed)
     nursery.kill(stopped, signal.SIGTERM)
     for child in (stopped, killed, misused, failed):  # in whatever order
