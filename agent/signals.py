@@ -8,6 +8,7 @@ Processes that it starts inherit what is ignored.
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable
 from types import FrameType
@@ -19,9 +20,19 @@ Handlers = dict[int, Any]  # of signals; what signal.signal returns
 
 def heed(handler: Handler) -> Handlers:
     """Have `handler` called when this program is asked to end; returns what was there before, for `restore`."""
+    terminal = [stream for stream in (1, 2) if os.isatty(stream)]
+
+    def asked_to_end(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:  # what is still to be said would fail on a terminal that is gone
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in terminal:
+                os.dup2(nowhere, stream)
+            os.close(nowhere)
+        handler(number, frame)
+
     asked = [signal.SIGTERM]
     asked += [number for number in (signal.SIGINT, signal.SIGHUP) if signal.getsignal(number) is not signal.SIG_IGN]
-    return {number: signal.signal(number, handler) for number in asked}
+    return {number: signal.signal(number, asked_to_end) for number in asked}
 
 
 def restore(handlers: Handlers) -> None:

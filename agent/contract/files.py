@@ -25,6 +25,8 @@ def digest(document: Any) -> str:
 
 def refuse_overwrite(path: Path, *, force: bool) -> None:
     """Raise InputError where `path` exists and `force` was not given, or its folder does not exist."""
+    if path.is_symlink():  # renaming would replace the link, and leave alone what it leads to
+        raise InputError(f"{path} is a symbolic link and will not be replaced; name the file that it leads to")
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file in it")
     if path.exists() and not path.is_file():

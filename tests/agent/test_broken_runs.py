@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+import pty
 import re
+import select
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from runs import (
     freeze,
     kill,
     logged,
+    program,
     roles_left,
     run_here,
     started,
@@ -157,6 +162,50 @@ def test_killed_launcher_leaves_no_process(lone_path: Path, tmp_path: Path) -> N
     while sockets.exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+TERMINAL = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+
+
+def test_a_closed_terminal_leaves_no_process(lone_path: Path, tmp_path: Path) -> None:
+    """It is SIGHUP: the run ends in order, exit 129, though nothing can be said any more."""
+    recording = tmp_path / "run.mcap"
+    ours, theirs = pty.openpty()
+    command = program("run", lone_path, "--steps", MANY, "-o", recording)
+    launcher = subprocess.Popen(
+        [sys.executable, "-c", TERMINAL, *command], stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True
+    )
+    try:
+        os.close(theirs)
+        deadline = time.monotonic() + PATIENCE
+        while not recording.with_name("run.mcap.part").exists():
+            assert time.monotonic() < deadline
+            if select.select([ours], [], [], 0.05)[0]:
+                os.read(ours, 65536)
+        crew = list(children(launcher.pid))
+        assert len(crew) == 4
+        os.close(ours)
+        assert launcher.wait(PATIENCE) == 129
+        wait_until_gone(crew)
+    finally:
+        launcher.kill()
+        launcher.wait()
+    end = end_of(recording)
+    assert end is not None
+    assert (end["status"], end["reason"]) == ("stopped", "the terminal was closed")
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_nothing(lone_path: Path, tmp_path: Path, closed: str) -> None:
+    """Whoever starts a run without stdin, stdout or stderr has it all the same, and nothing else is taken for them."""
+    recording = tmp_path / "run.mcap"
+    command = program("run", lone_path, "--steps", 5, "-o", recording)
+    done = subprocess.run(
+        ["/bin/sh", "-c", f'exec "$@" {closed}', "sh", *command], capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert ("5 steps" in done.stdout) == (closed == "2>&-")
+    assert replay(recording).exit_code == 0
 
 
 def test_frozen_node_is_named_after_the_deadline(pair_path: Path, tmp_path: Path, pair: Gains) -> None:

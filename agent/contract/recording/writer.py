@@ -215,7 +215,7 @@ class _Part:
             self._check_that_it_is_there()
             os.fsync(self._file.fileno())
             self._file.close()
-            if self._path.exists() and not self._force:
+            if os.path.lexists(self._path) and not self._force:
                 raise FileExistsError(errno.EEXIST, f"something else has this name by now; see {self._unfinished.name}")
             self._unfinished.replace(self._path)
         except OSError as error:

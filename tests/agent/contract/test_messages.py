@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from typing import Any
 
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from agent.contract import messages
 from agent.contract.keys import node_who
 from agent.contract.messages import (
     DIGEST_SIZE,
@@ -162,3 +164,19 @@ def test_a_digest_is_of_the_topic_and_the_payload() -> None:
     digests = {digest_of(topic, payload) for topic in ("mode", "mode1", "event") for payload in (b"", b"1", b"11")}
     assert len(digests) == 9
     assert {len(digest) for digest in digests} == {DIGEST_SIZE}
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        messages.Joining(who="plant", session="s", version="1", listen="none", machine="", lease=1.0, lacks=[]),
+        messages.Leaving(who="plant", reason="enough"),
+        messages.Ready(who="plant", session="s", gains="g"),
+        messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
+        messages.Acknowledged(steps=0, messages=0, missing=0, received={}, reached={}, lacking=[], closed=False),
+    ],
+)
+def test_words_of_a_newer_version_may_say_more(word: messages.Ready) -> None:
+    """What is not known here is left out; versions are compared, so that nobody depends on it."""
+    document = json.loads(word.model_dump_json()) | {"more": [1, 2, 3]}
+    assert type(word).model_validate_json(json.dumps(document)) == word

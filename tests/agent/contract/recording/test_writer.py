@@ -384,6 +384,20 @@ def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
             RecordingWriter(path, run=RUN, gains=GAINS, force=True)
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_is_never_replaced(tmp_path: Path, there: bool) -> None:
+    """Nor what it leads to, be it there or not."""
+    link, target = tmp_path / "run.mcap", tmp_path / "other.mcap"
+    link.symlink_to(target)
+    if there:
+        target.write_text("mine")
+    for force in (False, True):
+        with pytest.raises(InputError, match=r"run\.mcap is a symbolic link and will not be replaced"):
+            RecordingWriter(link, run=RUN, gains=GAINS, force=force)
+    assert link.is_symlink()
+    assert target.exists() == there
+
+
 def test_a_folder_that_may_not_be_written_to_is_named_before_anything_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
