@@ -148,7 +148,8 @@ def seen(parent: int, at: float) -> list[tuple[str, Sample]]:
                 continue
             whose = f" {words[words.index('--node') + 1]}" if role == "node" else ""
             memory = int(fields[21]) * os.sysconf("SC_PAGE_SIZE") // 1024
-            found.append((f"{role}{whose} ({pid})", Sample(at, memory, len(os.listdir(path / "fd")))))
+            if memory and (descriptors := len(os.listdir(path / "fd"))):  # neither is there of one that is just ending
+                found.append((f"{role}{whose} ({pid})", Sample(at, memory, descriptors)))
         except (OSError, IndexError):
             continue  # it has ended meanwhile
     return found
