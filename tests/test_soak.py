@@ -18,15 +18,15 @@ from designer.replay import replay
 from designer.replay.verdict import Verdict
 
 STEPS = 120
-FAULTS = (  # the kills first: who is killed has until the end to come back, however busy the machine is
-    "kill:node=2,step=10",
-    "kill:plant,step=14",
-    "kill:recorder,step=18",
-    "kill:coordinator,step=22",
-    "freeze:node=3,step=40,for=300ms",
-    "mute-link:plant>1,steps=45-55",
-    "delay:node=4,by=100ms,steps=50-60",
-    "drop:probability=0.1,steps=60-80",
+FAULTS = (  # who is killed is back before the next one is, or nobody has what they were to tell each other
+    "kill:coordinator,step=8",
+    "kill:node=2,step=18",
+    "kill:plant,step=28",
+    "kill:recorder,step=45",
+    "freeze:node=3,step=60,for=300ms",
+    "mute-link:plant>1,steps=65-75",
+    "delay:node=4,by=100ms,steps=70-80",
+    "drop:probability=0.1,steps=80-100",
 )
 
 
