@@ -63,6 +63,8 @@ class Record:
         """Read what there is, end the part that was cut, and begin the next."""
         for logged in cut.before():
             self._again(logged)
+        for _ in self._chains.rest():
+            pass  # the evidence of those parts stands in them
         cut.set_aside()
         self._writer = RecordingWriter(self._path, run=run, gains=gains, split=split, first=cut.part)
         for logged in cut.messages():
@@ -74,6 +76,7 @@ class Record:
         """Take in a message that an earlier recorder has recorded; what its sender says of it, it has said there."""
         model = model_of(logged.topic)
         if model in (None, Evidence):
+            self._blocks += model is Evidence and self._writer is None
             return
         message = decode(logged.topic, logged.payload)
         sender = message.who if isinstance(message, Event | Account) else sender_of(logged.topic)
@@ -97,6 +100,8 @@ class Record:
         if not self.receipts.take(sample.topic, step, stamp):
             return False
         if self._writer is None:
+            if stamp is not None and not self.failure:  # it stands in a part that is whole
+                self._chains.add(stamp, step)
             return True
         now = time.time_ns() if at is None else at
         number, published = (stamp.number, stamp.time) if stamp is not None else (0, now)

@@ -56,6 +56,7 @@ class Timekeeper:
                     self._stood(stood)
             self._bus.publish(MODE, Mode(step=step, mode=problem.mode_names[mode]))
             tick(step)
+            self._hear_accounts()  # what is not taken holds memory, and in the end its link
             self._refuse_haste(step)
         self._listen(time.monotonic() + self._pace.period + ACCOUNT_SECONDS, until=self._all_told)
 
@@ -75,7 +76,6 @@ class Timekeeper:
         """RunBroken where most of what the nodes tell soon after the beginning was too late, though nobody wills it."""
         if self._is_judged or self._plan.faults:
             return
-        self._hear_accounts()
         accounts, nodes = list(self._accounts.values()), self._gains.problem.n
         if len(accounts) < nodes:
             return

@@ -277,3 +277,13 @@ def test_a_namesake_costs_the_first_nothing() -> None:
             assert first.error is None
             assert isinstance(second.error, Refused)
             assert broken(outcome) == []
+
+
+def test_a_recorder_may_be_killed_twice() -> None:
+    """The third one has the evidence go on through parts that it finds whole."""
+    for seed in range(3):
+        twice = asked(Trouble("kill", RECORDER, 0.25), Trouble("kill", RECORDER, 0.85))
+        with simulated(replace(twice, seed=seed)) as outcome:
+            assert len(files_of(outcome.recording)) == 3
+            assert outcome.unrecorded == []
+            assert broken(outcome) == []

@@ -81,7 +81,13 @@ def _later(one: Facts | None, other: Facts | None) -> Facts | None:
     """The last word of a run of two: a part that is not the last says that the run continues."""
     if one is None or other is None:
         return one or other
-    return max(one, other, key=lambda end: (end["status"] != CONTINUES, _steps(end)))
+    return max(one, other, key=_place)
+
+
+def _place(end: Facts) -> tuple[bool, int, int, str]:
+    """By which the last of several comes last: of two parts that end in the same step, by what the next is called."""
+    following = end.get("next", "")
+    return end["status"] != CONTINUES, _steps(end), len(following), following
 
 
 def _steps(end: Facts) -> int:

@@ -22,6 +22,8 @@ class Wire:
 
     def __init__(self, accounts: list[Account]) -> None:
         self.sent: list[Mode] = []
+        self.more: list[Account] = []  # that come with every step
+        self.most = 0  # that have waited
         self.present = {"recorder"}
         self._accounts = accounts
 
@@ -36,6 +38,8 @@ class Wire:
     def publish(self, topic: str, message: Mode) -> None:
         assert topic == "mode"
         self.sent.append(message)
+        self.most = max(self.most, len(self._accounts))
+        self._accounts += self.more
 
     def receive(self, *, timeout: float) -> None:
         return None
@@ -48,9 +52,19 @@ def account(who: str, *, substituted: int, step: int = 30) -> Account:
     return Account(who=who, step=step, processor=0.31, **counts, **times)
 
 
-def kept(gains: Gains, accounts: list[Account], *, first: int = 0, recorded: int = 0, steps: int = 5) -> Wire:
+def kept(
+    gains: Gains,
+    accounts: list[Account],
+    *,
+    first: int = 0,
+    recorded: int = 0,
+    steps: int = 5,
+    more: list[Account] | None = None,
+    faults: tuple[str, ...] = (),
+) -> Wire:
     wire = Wire(accounts)
-    plan = Plan(steps, seed=1, pace=PACE)
+    wire.more = more or []
+    plan = Plan(steps, seed=1, pace=PACE, faults=faults)
     keeper = Timekeeper(wire, gains, plan, heed=lambda word: None, stood=lambda seconds: None)  # type: ignore[arg-type]
     keeper.keep_time(lambda step: None, first=first, recorded=recorded)
     return wire
@@ -84,3 +98,10 @@ def test_one_node_that_is_late_does_not_make_a_period_too_short(gains: Gains) ->
     accounts = everybody(gains, substituted=0)
     accounts[0] = accounts[0].model_copy(update={"pairs_substituted": 100})
     assert len(kept(gains, accounts).sent) == 5
+
+
+@pytest.mark.parametrize("faults", [(), ("drop:probability=0.1",)])
+def test_accounts_do_not_pile_up(gains: Gains, faults: tuple[str, ...]) -> None:
+    """They come now and then for as long as a run takes; one that is not taken holds the memory that it came in."""
+    more = everybody(gains, substituted=0)
+    assert kept(gains, [], steps=20, more=more, faults=faults).most <= len(more)

@@ -74,6 +74,7 @@ class Door:
         self._net, self._log, self._hand_over = net, log, hand_over
         self.process: Process = process
         self.is_open = True
+        self.traced = False
         self.declared: list[Declared] = []
         self.peers: dict[Door, Pipe] = {}
         self._known: dict[Door, set[Declared]] = {}  # what each peer has declared, as far as that has come

@@ -13,13 +13,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from agent.network.configuration import LEASE_MS
 from simulated.machine import Machine
 
 if TYPE_CHECKING:
     from simulated.door import Door
 
-LEASE = LEASE_MS / 1e3
+LEASE = 10.0  # seconds without a word after which a link is lost
 TO_SEE_THE_END = 0.05  # seconds after which a killed process is missed, at most
 Do = Callable[[], None]
 

@@ -60,6 +60,7 @@ def _stand_ins(machine: Machine, seed: int) -> dict[int, Any]:
     real: dict[Any, Any] = {
         time: _Time(machine),
         threading: SimpleNamespace(Thread=lambda **about: _Thread(machine, **about)),
+        threading.Thread: lambda **about: _Thread(machine, **about),
         queue.SimpleQueue: lambda: Queue(machine),
         os: _Os(chance),
         datetime.datetime: _Datetime(machine),
@@ -93,12 +94,24 @@ class _Thread:
     ) -> None:
         assert daemon, "a thread that outlives the main one"
         self._machine, self._name = machine, name
-        self._work = lambda: target(*args)
+        self._target, self._args = target, args
+        self._runs = False
 
     def start(self) -> None:
         process = self._machine.process
         assert process is not None
+        self._runs = True
         self._machine.start(process, self._work, self._name)
+
+    def _work(self) -> None:
+        self._target(*self._args)
+        self._runs = False
+
+    def join(self, timeout: float) -> None:
+        """Looks now and then."""
+        deadline = self._machine.now + timeout
+        while self._runs and self._machine.now < deadline:
+            self._machine.sleep(min(0.01, timeout))
 
 
 class _Os:

@@ -22,6 +22,7 @@ from agent.plan import RecordingPlan
 from agent.roles import coordinator, node, plant, recorder
 from simulated.door import Door, Published
 from simulated.machine import Machine, Process
+from simulated.network import LEASE
 from simulated.network import Network as Links
 from simulated.scenario import Scenario, Trouble
 from simulated.stand_ins import put_in_place
@@ -139,7 +140,7 @@ class World:
             member.process.on_signal = handler
             return {}
 
-        network = Network(connect=() if who == COORDINATOR else ("tcp/simulated",), wait=scenario.wait)
+        network = Network(connect=() if who == COORDINATOR else ("tcp/simulated",), wait=scenario.wait, lease=LEASE)
         door: Any = partial(Door, self.net, self.published)
         with Bus(network, run=RUN, who=who, session=door, signals=keep) as bus:
             self._buses[member.process.name] = bus

@@ -253,6 +253,20 @@ def test_parts_end_when_it_is_time(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert [messages_of(file) for file in files_of(tmp_path / "run.mcap")] == [MESSAGES[:1], MESSAGES[1:2]]
 
 
+def test_parts_that_end_in_the_same_step_are_read_one_after_the_other(tmp_path: Path) -> None:
+    """As they are where recorders are killed soon after each other; the tenth comes after the ninth."""
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path, run=RUN, gains=GAINS) as writer:
+        for _ in range(11):
+            writer.add(MESSAGES[0])
+            writer.next_part({"steps": "1"})
+        writer.add(MESSAGES[0])
+        writer.finish(END)
+    with RecordingReader(path) as reader:
+        assert len(list(reader.messages())) == 12
+        assert reader.end == END
+
+
 def test_a_recording_that_is_not_split_is_part_1(tmp_path: Path) -> None:
     with RecordingReader(write(tmp_path / "run.mcap")) as reader:
         assert reader.run["part"] == "1"
