@@ -73,6 +73,24 @@ def _cost(norm: float, radius: float) -> float:
     return norm / (1.0 - radius) if radius < 1.0 else math.inf
 
 
+def _rank(candidate: Candidate) -> tuple[float, float]:
+    """The less, the better."""
+    return candidate.gain.high, candidate.gain.radius
+
+
+class _Stable(NamedTuple):
+    """Gains on the way; P satisfies (17), None where the errors are not mean-square stable."""
+
+    v: Array
+    P: Array | None  # (modes, n_eta, n_eta)
+    radius: float
+
+    @property
+    def cost(self) -> float:
+        """As that of a candidate; infinite without P."""
+        return math.inf if self.P is None else _cost(float(np.linalg.norm(self.v)), self.radius)
+
+
 class Descent(NamedTuple):
     """What the search found: `chosen` is at most 0.1 % above `least`, and smaller or faster to decay."""
 
@@ -140,17 +158,17 @@ class _Search:
         self.barrier = Barrier(problem, _HORIZON)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
-        self.stable: list[Array] = []  # v of the mean-square stable gains that the weights led to
+        self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
         self.centred: list[Array] = []  # v of ever smaller gains
 
     # the way down
     def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
         """The best start by these weights, on longer horizons while T is too short; then to the centre."""
         found = {name: self._candidate(self.barrier.entries.pack(*gains)) for name, gains in starts.items()}
-        self.start = min(found, key=lambda name: (found[name].gain.high, found[name].gain.radius))
-        v = self.barrier.entries.pack(*starts[self.start])
-        if found[self.start].gain.stable:
-            self.stable.append(v)
+        self.start = min(found, key=lambda name: _rank(found[name]))
+        v, gain = self.barrier.entries.pack(*starts[self.start]), found[self.start].gain
+        if gain.stable:
+            self.stable.append(_Stable(v, gain.P, gain.radius))
         x, radius, left = self._begin(v), math.inf, list(weights)
         while left:
             point = self._follow(left[0], x)
@@ -158,11 +176,11 @@ class _Search:
             operator = self.barrier.operator(x[:-1])
             P, grows = lyapunov(operator)
             if P is not None:
-                self.stable.append(x[:-1])
+                self.stable.append(_Stable(x[:-1], P, grows))
             elif not self._may_be_longer() or not (self.stable or grows < radius * _SLOWER):
                 return
             elif self.stable:
-                x = np.append(self.stable[-1], x[-1])
+                x = np.append(self.stable[-1].v, x[-1])
             radius = min(radius, grows)
             if P is None or self._is_short(operator, x, P, left[0]):
                 self.barrier.horizon, self.best = 2 * self.barrier.horizon, None
@@ -249,32 +267,37 @@ class _Search:
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
         """The least gain of all that was found, and the gains to take."""
-        best = [] if self.best is None else [self.best[:-1]]
-        found = [self._candidate(v) for v in (*self.stable[-1:], *best)]
-        if not any(candidate.gain.stable for candidate in found):
-            found += [self._candidate(self.barrier.entries.pack(*gains)) for gains in starts.values()]
-        least = min(found, key=lambda candidate: (candidate.gain.high, candidate.gain.radius))
-        if not least.gain.stable:
-            return least, least
-        near = self._near(least)
-        if not near or min(near)[0] >= least.cost:
-            return least, least
-        return least, self._candidate(near[min(near)])
+        offered = [] if self.best is None else [self.best[:-1]]
+        offered += [each.v for each in self.stable[-1:]]
+        if not self.stable:
+            offered += [self.barrier.entries.pack(*gains) for gains in starts.values()]
+        least = self._candidate(offered[0])
+        for v in offered[1:]:
+            if self._may_be_less(v, least):
+                least = min(least, self._candidate(v), key=_rank)
+        near = self._near(least) if least.gain.stable else None
+        return least, least if near is None else self._candidate(near)
 
-    def _near(self, least: Candidate) -> dict[tuple[float, int], Array]:
-        """v of the gains that guarantee _SLACK times the least gamma, by their cost.
+    def _may_be_less(self, v: Array, least: Candidate) -> bool:
+        """Whether no few steps show that the gain is not below this one."""
+        operator, gain = self.barrier.operator(v), least.gain
+        return not gain.stable or recursion_holds(operator, gain.low**2, 2 * gain.horizon).holds is not False
+
+    def _near(self, least: Candidate) -> Array | None:
+        """v of the gains of least cost that guarantee _SLACK times the least gamma; None where none cost less.
 
         They are sought among the last of the centred ones and every tenth before it: the last alone would not do, for
         what grows too slowly to be seen within T steps, centring lets grow.
         """
-        near: dict[tuple[float, int], Array] = {}
-        for v in (*self.centred[::-10], *self.stable):
-            operator = self.barrier.operator(v)
-            P, radius = lyapunov(operator)
-            g = (_SLACK * least.gain.high) ** 2
-            if P is not None and recursion_holds(operator, g, _LONG, invariant=InvariantSet(P)).holds:
-                near[_cost(float(np.linalg.norm(v)), radius), len(near)] = v
-        return near
+        centred = (_Stable(v, *lyapunov(self.barrier.operator(v))) for v in self.centred[::-10])
+        g = (_SLACK * least.gain.high) ** 2
+        for each in sorted((*centred, *self.stable), key=lambda each: each.cost):
+            if each.P is None or each.cost >= least.cost:
+                break
+            operator = self.barrier.operator(each.v)
+            if recursion_holds(operator, g, _LONG, invariant=InvariantSet(each.P)).holds:
+                return each.v
+        return None
 
     def _candidate(self, v: Array) -> Candidate:
         K_bar, H_bar = self.barrier.entries.unpack(v)

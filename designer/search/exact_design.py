@@ -12,7 +12,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, exact_gain
+from designer.gain.exact import Gain, Operator, exact_gain, lyapunov
 from designer.gain.floor import floor
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
@@ -99,7 +99,7 @@ def design_exact(
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
     starts = {"least variance": least_variance_gains(problem)}
-    if not exact_gain(error_model(problem, *starts["least variance"])).stable:
+    if lyapunov(Operator(error_model(problem, *starts["least variance"])))[0] is None:
         starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None

@@ -171,11 +171,10 @@ def test_a_second_thought_while_the_choice_is_made_does_not_lose_it(monkeypatch:
     """Ctrl-C then comes once more than the search needs it, and the gains are there all the same."""
     problem, pressed = find("two-nodes"), []
 
-    def near(self: Any, least: Any) -> dict[tuple[float, int], Array]:
+    def near(self: Any, least: Any) -> None:
         if not pressed:
             pressed.append(True)
             raise KeyboardInterrupt
-        return {}
 
     monkeypatch.setattr(descent._Search, "_near", near)
     monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:2])
