@@ -28,12 +28,12 @@ from designer.search import bfgs
 from designer.search.barrier import Barrier
 
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
-_NEAR = 3  # weights that are passed over where the start is near
+NEAR = 9e-4  # the first mu where the start is near
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
 _RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
 _HORIZON = 20
 _LONGEST = 640
-_NUMBERS = 1e8  # that the Y_bar of all steps may be: 0.8 GB
+_NUMBERS = 2e8  # that the Y_bar of all steps may be: 1.6 GB
 _SHORT = 1e-4  # gamma may exceed sqrt(g) by so much of itself, or by this part of mu, before T is doubled
 _SHORT_OF_MU = 0.3
 _LONG = 5000  # steps in which the recursion is to come to its end
@@ -121,15 +121,23 @@ class TimeIsUp(Exception):
     """Ends the search, as Ctrl-C does."""
 
 
+def longest_horizon(problem: Problem) -> int:
+    """The most steps that the search looks over, whether it comes to that or not."""
+    numbers, horizon = len(problem.topologies) * (problem.plant_states + problem.n * problem.nx) ** 2, _HORIZON
+    while 2 * horizon <= _LONGEST and 2 * horizon * numbers <= _NUMBERS:
+        horizon *= 2
+    return horizon
+
+
 def descend(
     problem: Problem,
     starts: Mapping[str, StackedGains],
     *,
-    near: bool = False,
+    first: float = math.inf,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Descent:
-    """The least exact gain found from the best of the given starts; `near`: it is known not to be far from that.
+    """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
     returned.
@@ -137,7 +145,7 @@ def descend(
     search = _Search(problem, Budget() if budget is None else budget, progress)
     ended = "converged"
     try:
-        search.run(starts, _WEIGHTS[_NEAR:] if near else _WEIGHTS)
+        search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:
@@ -150,12 +158,19 @@ def descend(
     return Descent(chosen, least, search.start, search.steps, ended)
 
 
+def follow(problem: Problem, start: StackedGains, weights: tuple[float, ...]) -> StackedGains | None:
+    """Gains from which the barrier falls no further by these weights; None where they are not mean-square stable."""
+    search = _Search(problem, Budget(), None)
+    search.follow(search.barrier.entries.pack(*start), weights)
+    return search.barrier.entries.unpack(search.stable[-1].v) if search.stable else None
+
+
 class _Search:
     """The state of one `descend`, so that it is there when the search is interrupted."""
 
     def __init__(self, problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None) -> None:
         self.problem, self.budget, self.progress = problem, budget, progress
-        self.barrier = Barrier(problem, _HORIZON)
+        self.barrier, self.longest = Barrier(problem, _HORIZON), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
@@ -169,6 +184,13 @@ class _Search:
         v, gain = self.barrier.entries.pack(*starts[self.start]), found[self.start].gain
         if gain.stable:
             self.stable.append(_Stable(v, gain.P, gain.radius))
+        x = self.follow(v, weights)
+        if x is not None:
+            self._centre(x)
+
+    def follow(self, v: Array, weights: tuple[float, ...]) -> Array | None:
+        """[v; y] at the end of these weights; None where the search ends before."""
+        self.budget.check()  # before there is a horizon of anything
         x, radius, left = self._begin(v), math.inf, list(weights)
         while left:
             point = self._follow(left[0], x)
@@ -178,7 +200,7 @@ class _Search:
             if P is not None:
                 self.stable.append(_Stable(x[:-1], P, grows))
             elif not self._may_be_longer() or not (self.stable or grows < radius * _SLOWER):
-                return
+                return None
             elif self.stable:
                 x = np.append(self.stable[-1].v, x[-1])
             radius = min(radius, grows)
@@ -187,11 +209,10 @@ class _Search:
                 x = self._begin(x[:-1])
             else:
                 left.pop(0)
-        self._centre(x)
+        return x
 
     def _may_be_longer(self) -> bool:
-        numbers = 2 * self.barrier.horizon * len(self.problem.topologies) * self.barrier.size**2
-        return 2 * self.barrier.horizon <= _LONGEST and numbers <= _NUMBERS
+        return 2 * self.barrier.horizon <= self.longest
 
     def _is_short(self, operator: Operator, x: Array, P: Array, mu: float) -> bool:
         """Whether the exact gain of these gains is above sqrt(g)."""

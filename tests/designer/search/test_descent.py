@@ -187,7 +187,7 @@ def test_a_near_start_passes_over_the_first_weights() -> None:
     """And ends where the whole way ends."""
     problem = find("two-nodes")
     whole = descend(problem, {"least variance": least_variance_gains(problem)})
-    again = descend(problem, {"whole": (whole.least.K_bar, whole.least.H_bar)}, near=True)
+    again = descend(problem, {"whole": (whole.least.K_bar, whole.least.H_bar)}, first=descent.NEAR)
     assert again.steps < whole.steps
     assert again.least.gain.high <= whole.least.gain.high * (1.0 + 1e-4)
 
