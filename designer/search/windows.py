@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.problem import Problem
-from designer.model.error_model import Indices, StackedGains, measurement_slices
+from designer.gain.exact import Operator, lyapunov
+from designer.gain.products import banded_order
+from designer.model.error_model import Indices, StackedGains, error_model, measurement_slices
 from designer.search.descent import Budget, TimeIsUp, follow
 from designer.search.starts import least_variance_gains
 from designer.workers import each
@@ -22,6 +24,7 @@ _CORE = 20  # nodes
 _NODES = 40  # of a window: as many rings of neighbours around the core as come to it
 _MOST = 100  # of the largest window: where nodes hear many others, windows are no small networks
 WEIGHT = 9e-3  # mu; for less the nodes outside count
+_HALVES = 3
 
 
 class Window(NamedTuple):
@@ -40,12 +43,8 @@ class Windowed(NamedTuple):
 
 def windows(problem: Problem) -> list[Window]:
     """Every node is in one core. Empty where a window would have more than 100 nodes."""
-    from scipy import sparse  # takes 0.2 s to import
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
     linked = np.asarray(sum(t.adjacency + t.adjacency.T for t in problem.topologies) != 0.0)
-    order = reverse_cuthill_mckee(sparse.csr_matrix(linked), symmetric_mode=True)
-    found = []
+    order, found = banded_order(linked), []
     for first in range(0, problem.n, _CORE):
         core = np.sort(order[first : first + _CORE])
         nodes, before = _with_neighbours(linked, core), core
@@ -65,14 +64,13 @@ def window_gains(problem: Problem, gains: StackedGains, *, budget: Budget, dask:
     """The given gains, and in their place, for every core, those of its window, where that has stable ones.
 
     On the processes of `designer.workers.each`; the numbers do not depend on who computes them. KeyboardInterrupt and
-    the end of the budget leave the rest as it is.
+    the end of the budget leave the rest as it is. Where the errors then grow, the way back is gone by halves.
     """
-    found = windows(problem)
+    found, ended = windows(problem), None
     K_bar, H_bar = (part.copy() for part in gains)
     columns, nx = measurement_slices(problem), problem.nx
-    results = each(_descended, _parts(problem, found), dask=dask)
     try:
-        for (core, nodes), result in zip(found, results, strict=True):
+        for (core, nodes), result in zip(found, each(_descended, _parts(problem, found), dask=dask), strict=True):
             if result is not None:
                 rows = _entries(core, nx)
                 own = np.isin(_entries(nodes, nx), rows)
@@ -80,9 +78,15 @@ def window_gains(problem: Problem, gains: StackedGains, *, budget: Budget, dask:
                 K_bar[:, rows[:, None], _entries(nodes, nx)] = result[0][:, own]
                 H_bar[:, rows[:, None], measured] = result[1][:, own]
             budget.check()
-    except (KeyboardInterrupt, TimeIsUp) as why:
-        return Windowed((K_bar, H_bar), "out of time" if isinstance(why, TimeIsUp) else "interrupted")
-    return Windowed((K_bar, H_bar), None)
+    except KeyboardInterrupt:
+        ended = "interrupted"
+    except TimeIsUp:
+        ended = "out of time"
+    for _ in range(_HALVES):
+        if lyapunov(Operator(error_model(problem, K_bar, H_bar)))[0] is not None:
+            break
+        K_bar, H_bar = (K_bar + gains[0]) / 2.0, (H_bar + gains[1]) / 2.0
+    return Windowed((K_bar, H_bar), ended)
 
 
 def _entries(nodes: Indices, nx: int) -> Indices:
