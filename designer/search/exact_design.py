@@ -24,6 +24,7 @@ from designer.search.effort import in_windows, refuse_without_memory, whole_fits
 from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
 from designer.search.windows import WEIGHT as WEIGHT_OF_WINDOWS
 from designer.search.windows import window_gains
+from designer.workers import greet_cluster
 
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
@@ -49,6 +50,8 @@ def design_exact(
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
+    if dask is not None:
+        greet_cluster(dask)  # before the starts, which may take minutes
     if math.isinf(floor(problem)):
         raise Unattainable(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
