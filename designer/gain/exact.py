@@ -205,27 +205,22 @@ def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: In
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
-def exact_gain(model: ErrorModel, *, above: float | None = None) -> Gain:
-    """The exact gain of an error model, between bounds that differ by 1e-6 of its square where steps suffice.
-
-    `above`: a lower bound of gamma^2, where the search begins.
-    """
+def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
+    """The exact gain of an error model, between bounds that differ by `width` of its square where steps suffice."""
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     P, radius = lyapunov(operator)
     if P is None:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, radius)
-    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), above, _WIDTH)
+    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), width)
     return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P, radius)
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def horizon_gain(
-    operator: Operator, horizon: int, *, width: float = _WIDTH, above: float | None = None
-) -> tuple[float, float]:
+def horizon_gain(operator: Operator, horizon: int, *, width: float = _WIDTH) -> tuple[float, float]:
     """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high."""
-    found = _bracket(operator, horizon, None, above, width)
+    found = _bracket(operator, horizon, None, width)
     return found.low, found.high
 
 
@@ -235,9 +230,7 @@ class _Bracket(NamedTuple):
     horizon: int  # in which the recursion fails at low
 
 
-def _bracket(
-    operator: Operator, horizon: int, invariant: InvariantSet | None, above: float | None, width: float
-) -> _Bracket:
+def _bracket(operator: Operator, horizon: int, invariant: InvariantSet | None, width: float) -> _Bracket:
     """Where the recursion fails, and where it holds.
 
     As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
@@ -245,7 +238,7 @@ def _bracket(
     to its end at some g, the bracket stays wider.
     """
     low, steps, growth, tiny = 0.0, 1, 2.0, float(np.finfo(float).tiny)
-    g = growth * max(_impulse(operator) if above is None else above, tiny)
+    g = growth * max(_impulse(operator), tiny)
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > max(low * (1.0 + 1.001 * width), 2.0 * tiny):
         if not math.isfinite(g):

@@ -36,6 +36,7 @@ _LONGEST = 640
 _NUMBERS = 2e8  # that the Y_bar of all steps may be: 1.6 GB
 _SHORT = 1e-4  # gamma may exceed sqrt(g) by so much of itself, or by this part of mu, before T is doubled
 _SHORT_OF_MU = 0.3
+_COARSE = 1e-3  # of gamma^2, where starts are compared
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
@@ -73,9 +74,9 @@ def _cost(norm: float, radius: float) -> float:
     return norm / (1.0 - radius) if radius < 1.0 else math.inf
 
 
-def _rank(candidate: Candidate) -> tuple[float, float]:
+def _rank(gain: Gain) -> tuple[float, float]:
     """The less, the better."""
-    return candidate.gain.high, candidate.gain.radius
+    return gain.high, gain.radius
 
 
 class _Stable(NamedTuple):
@@ -179,9 +180,9 @@ class _Search:
     # the way down
     def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
         """The best start by these weights, on longer horizons while T is too short; then to the centre."""
-        found = {name: self._candidate(self.barrier.entries.pack(*gains)) for name, gains in starts.items()}
+        found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
         self.start = min(found, key=lambda name: _rank(found[name]))
-        v, gain = self.barrier.entries.pack(*starts[self.start]), found[self.start].gain
+        v, gain = self.barrier.entries.pack(*starts[self.start]), found[self.start]
         if gain.stable:
             self.stable.append(_Stable(v, gain.P, gain.radius))
         x = self.follow(v, weights)
@@ -295,7 +296,7 @@ class _Search:
         least = self._candidate(offered[0])
         for v in offered[1:]:
             if self._may_be_less(v, least):
-                least = min(least, self._candidate(v), key=_rank)
+                least = min(least, self._candidate(v), key=lambda candidate: _rank(candidate.gain))
         near = self._near(least) if least.gain.stable else None
         return least, least if near is None else self._candidate(near)
 
