@@ -45,7 +45,7 @@ ROOMS = {
     "designer.proof": "designer.decay",
     "designer.lmi": "designer.gain designer.model designer.proof",
     "designer.workers": "",
-    "designer.search": "designer.gain designer.lmi designer.model designer.proof designer.workers",
+    "designer.search": "designer.decay designer.gain designer.lmi designer.model designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "",
     "designer.ladder": "designer.lmi",

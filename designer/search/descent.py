@@ -22,7 +22,8 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, horizon_gain, lyapunov, recursion_holds
+from designer.decay import Decay
+from designer.gain.exact import Gain, InvariantSet, exact_gain, horizon_gain, lyapunov, recursion_holds
 from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
 from designer.search.barrier import Barrier
@@ -80,16 +81,16 @@ def _rank(gain: Gain) -> tuple[float, float]:
 
 
 class _Stable(NamedTuple):
-    """Gains on the way; P satisfies (17), None where the errors are not mean-square stable."""
+    """Mean-square stable gains on the way."""
 
     v: Array
-    P: Array | None  # (modes, n_eta, n_eta)
-    radius: float
+    P: Array  # (modes, n_eta, n_eta), satisfies (17)
+    decay: Decay
 
     @property
     def cost(self) -> float:
-        """As that of a candidate; infinite without P."""
-        return math.inf if self.P is None else _cost(float(np.linalg.norm(self.v)), self.radius)
+        """As that of a candidate."""
+        return _cost(float(np.linalg.norm(self.v)), self.decay.radius)
 
 
 class Descent(NamedTuple):
@@ -180,11 +181,12 @@ class _Search:
     # the way down
     def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
         """The best start by these weights, on longer horizons while T is too short; then to the centre."""
-        found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
-        self.start = min(found, key=lambda name: _rank(found[name]))
-        v, gain = self.barrier.entries.pack(*starts[self.start]), found[self.start]
-        if gain.stable:
-            self.stable.append(_Stable(v, gain.P, gain.radius))
+        self.start = next(iter(starts))
+        if len(starts) > 1:
+            found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
+            self.start = min(found, key=lambda name: _rank(found[name]))
+        v = self.barrier.entries.pack(*starts[self.start])
+        self._keep(v)
         x = self.follow(v, weights)
         if x is not None:
             self._centre(x)
@@ -196,28 +198,34 @@ class _Search:
         while left:
             point = self._follow(left[0], x)
             x = point.x
-            operator = self.barrier.operator(x[:-1])
-            P, grows = lyapunov(operator)
-            if P is not None:
-                self.stable.append(_Stable(x[:-1], P, grows))
-            elif not self._may_be_longer() or not (self.stable or grows < radius * _SLOWER):
-                return None
-            elif self.stable:
-                x = np.append(self.stable[-1].v, x[-1])
-            radius = min(radius, grows)
-            if P is None or self._is_short(operator, x, P, left[0]):
+            P, decays = self._keep(x[:-1])
+            if P is None:
+                if not self._may_be_longer() or not (self.stable or decays.radius < radius * _SLOWER):
+                    return None
+                if self.stable:
+                    x = np.append(self.stable[-1].v, x[-1])
+                else:
+                    radius = decays.radius
+            if P is None or self._is_short(x, P, left[0]):
                 self.barrier.horizon, self.best = 2 * self.barrier.horizon, None
                 x = self._begin(x[:-1])
             else:
                 left.pop(0)
         return x
 
+    def _keep(self, v: Array) -> tuple[Array | None, Decay]:
+        """What `lyapunov` says of gains, which are kept if they are mean-square stable."""
+        P, decays = lyapunov(self.barrier.operator(v))
+        if P is not None:
+            self.stable.append(_Stable(v, P, decays))
+        return P, decays
+
     def _may_be_longer(self) -> bool:
         return 2 * self.barrier.horizon <= self.longest
 
-    def _is_short(self, operator: Operator, x: Array, P: Array, mu: float) -> bool:
+    def _is_short(self, x: Array, P: Array, mu: float) -> bool:
         """Whether the exact gain of these gains is above sqrt(g)."""
-        above = 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
+        operator, above = self.barrier.operator(x[:-1]), 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
         trial = recursion_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
         return trial.holds is False and self._may_be_longer()
 
@@ -311,15 +319,17 @@ class _Search:
         They are sought among the last of the centred ones and every tenth before it: the last alone would not do, for
         what grows too slowly to be seen within T steps, centring lets grow.
         """
-        centred = (_Stable(v, *lyapunov(self.barrier.operator(v))) for v in self.centred[::-10])
-        g = (_SLACK * least.gain.high) ** 2
-        for each in sorted((*centred, *self.stable), key=lambda each: each.cost):
-            if each.P is None or each.cost >= least.cost:
-                break
-            operator = self.barrier.operator(each.v)
-            if recursion_holds(operator, g, _LONG, invariant=InvariantSet(each.P)).holds:
-                return each.v
-        return None
+        offered = list(self.stable)
+        for v in self.centred[::-10]:
+            P, decays = lyapunov(self.barrier.operator(v))
+            offered += [] if P is None else [_Stable(v, P, decays)]
+        near = [each for each in offered if self._holds(each, _SLACK * least.gain.high)]
+        best = min(near, key=lambda each: each.cost, default=None)
+        return None if best is None or best.cost >= least.cost else best.v
+
+    def _holds(self, stable: _Stable, gamma: float) -> bool:
+        operator, invariant = self.barrier.operator(stable.v), InvariantSet(stable.P)
+        return recursion_holds(operator, gamma**2, _LONG, invariant=invariant).holds is True
 
     def _candidate(self, v: Array) -> Candidate:
         K_bar, H_bar = self.barrier.entries.unpack(v)

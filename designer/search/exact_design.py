@@ -119,7 +119,7 @@ def _by_windows(
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
     descent = descend(
         problem,
-        {**starts, "windows": windowed.gains},
+        {"windows": windowed.gains},
         first=WEIGHT_OF_WINDOWS,
         budget=Budget(0.0) if ended else budget,
         progress=progress,

@@ -64,7 +64,8 @@ def window_gains(problem: Problem, gains: StackedGains, *, budget: Budget, dask:
     """The given gains, and in their place, for every core, those of its window, where that has stable ones.
 
     On the processes of `designer.workers.each`; the numbers do not depend on who computes them. KeyboardInterrupt and
-    the end of the budget leave the rest as it is. Where the errors then grow, the way back is gone by halves.
+    the end of the budget leave the rest as it is. Where the errors then grow, the way back is gone by
+    halves, and at last to its beginning.
     """
     found, ended = windows(problem), None
     K_bar, H_bar = (part.copy() for part in gains)
@@ -84,9 +85,9 @@ def window_gains(problem: Problem, gains: StackedGains, *, budget: Budget, dask:
         ended = "out of time"
     for _ in range(_HALVES):
         if lyapunov(Operator(error_model(problem, K_bar, H_bar)))[0] is not None:
-            break
+            return Windowed((K_bar, H_bar), ended)
         K_bar, H_bar = (K_bar + gains[0]) / 2.0, (H_bar + gains[1]) / 2.0
-    return Windowed((K_bar, H_bar), ended)
+    return Windowed(gains, ended)
 
 
 def _entries(nodes: Indices, nx: int) -> Indices:
