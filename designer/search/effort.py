@@ -1,7 +1,8 @@
 """What the search for the least exact gain takes, estimated before it begins: what the default method depends on.
 
-The time is that of about a thousand gradients, and a gradient costs a bit and, for large networks, what it takes to
-pass over Y_bar. To the end of the search, which a budget may come before.
+The time is that of many gradients, and a gradient costs a bit and, for large networks, what it takes to pass over
+Y_bar. How many it takes depends on more than can be known beforehand: docs/theory.md, section 6, says how far off the
+estimate was. It is of the whole search, whose end a budget may come before.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from designer.search.windows import windows
 MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
 BUDGET = 600.0  # seconds
 LONG = 60.0  # worth a word beforehand
-_GRADIENTS = 1000
+_GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
+_MORE = 2.65  # times as many of large networks
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
 _WORK = 50  # matrices as large as Y_bar that the search keeps beside those of the horizon
@@ -39,7 +41,12 @@ def in_windows(problem: Problem) -> bool:
 
 def seconds_of_exact(problem: Problem) -> float:
     """Estimated processor time of method "exact" without a budget."""
-    return _GRADIENTS * (_OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem))
+    return gradients_of_exact(problem) * (_OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem))
+
+
+def gradients_of_exact(problem: Problem) -> float:
+    """Estimated number of gradients over 20 steps; one over 40 counts twice."""
+    return _GRADIENTS * min(max(problem.n / 6.0, 1.0), _MORE)
 
 
 def whole_fits(problem: Problem, *, free: float | None = None) -> bool:

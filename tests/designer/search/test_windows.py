@@ -91,7 +91,7 @@ def test_what_windows_led_to_is_kept_when_time_is_over(small: None, monkeypatch:
     """The clock is asked once for each window: the first core has other gains, the rest those from before."""
     problem = banded(24)
     start = least_variance_gains(problem)
-    monkeypatch.setattr(room, "_descended", lambda part: tuple(2.0 * each for each in least_variance_gains(part)))
+    monkeypatch.setattr(room, "_descended", lambda part: tuple(1.001 * each for each in least_variance_gains(part)))
     found = window_gains(problem, start, budget=Budget(1.0, clock=partial(next, itertools.count())))
     assert found.ended == "out of time"
     changed = [i for i in range(24) if not np.array_equal(*(rows_of(problem, g, i)[0] for g in (start, found.gains)))]
@@ -106,6 +106,24 @@ def test_a_window_without_stable_gains_keeps_those_from_before(small: None, monk
         np.testing.assert_array_equal(before, after)
 
 
+@pytest.mark.parametrize(("factor", "stays"), [(1.5, False), (1e6, True)])
+def test_where_errors_would_grow_less_is_taken_of_the_windows(
+    small: None, monkeypatch: pytest.MonkeyPatch, factor: float, stays: bool
+) -> None:
+    """Half of the way, or a quarter; and nothing where that is too much."""
+    problem = banded(16)
+    start = least_variance_gains(problem)
+
+    def too_much(part: Problem) -> StackedGains:
+        K_bar, H_bar = least_variance_gains(part)
+        return factor * K_bar, H_bar
+
+    monkeypatch.setattr(room, "_descended", too_much)
+    found = window_gains(problem, start, budget=Budget()).gains
+    assert np.array_equal(found[0], start[0]) == stays
+    assert exact_gain(error_model(problem, *found)).stable
+
+
 def test_ctrl_c_keeps_the_windows_that_are_done(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = banded(16)
     start, done = least_variance_gains(problem), []
@@ -115,7 +133,7 @@ def test_ctrl_c_keeps_the_windows_that_are_done(small: None, monkeypatch: pytest
             raise KeyboardInterrupt
         done.append(part)
         K_bar, H_bar = least_variance_gains(part)
-        return 2.0 * K_bar, H_bar
+        return 1.001 * K_bar, H_bar
 
     monkeypatch.setattr(room, "_descended", descended)
     found = window_gains(problem, start, budget=Budget())
