@@ -128,7 +128,7 @@ def everybody_hears_everybody(n: int) -> Problem:
 def test_the_estimate_grows_with_the_square_of_large_networks() -> None:
     seconds = [seconds_of_exact(banded(n)) for n in (4, 8, 16, 32, 64, 128)]
     ratios = [later / earlier for earlier, later in pairwise(seconds)]
-    assert ratios == sorted(ratios)
+    assert min(ratios) > 1.1
     assert 3.5 < ratios[-1] < 4.0
 
 
