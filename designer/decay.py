@@ -14,7 +14,7 @@ All that is found here is found in floats; what is claimed of it is proved in de
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -31,12 +31,16 @@ _HUGE = 1e150
 _REST = 0.25  # what is left of U may be off by, measured by U
 
 
-class Decay(NamedTuple):
+class Decay:
     """Z, (modes, n, n), with Z - L(Z) = rest > 0, or None where floats find none that surely has; and the radius."""
 
-    total: Array | None
-    rest: Array | None
-    radius: float  # spectral radius of L
+    def __init__(self, total: Array | None, rest: Array | None, radius: Callable[[], float]) -> None:
+        self.total, self.rest, self._radius = total, rest, radius
+
+    @cached_property
+    def radius(self) -> float:
+        """Spectral radius of L: of large networks it takes several times as long as Z, so only who asks pays for it."""
+        return self._radius()
 
     @property
     def dies_out(self) -> bool:
@@ -53,8 +57,11 @@ def decay(L: Map, modes: int, units: Array) -> Decay:
         return np.asarray((X + X.swapaxes(1, 2)) / 2.0)
 
     total, rest = _total(scaled, modes, n)
-    radius = spectral_radius(scaled, modes, n)
-    return Decay(None if total is None else total * both, None if rest is None else rest * both, radius)
+    return Decay(
+        None if total is None else total * both,
+        None if rest is None else rest * both,
+        partial(spectral_radius, scaled, modes, n),
+    )
 
 
 def is_positive(Z: Array) -> bool:

@@ -29,11 +29,13 @@ def design(
     method: str | None = None,
     budget: float = BUDGET,
     progress: Callable[[Progress], None] | None = None,
+    dask: str | None = None,
 ) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
-    The default method is "exact" up to 100 nodes, else "decomposed". `progress` and `budget` are for the method
-    "exact", which returns its best gains when its seconds are over, the proof after that, and on KeyboardInterrupt.
+    The default method is "exact"; for more than 200 nodes of whom some hear very many others it is "decomposed".
+    `progress` and `budget` are for the method "exact", which returns its best gains when its seconds are over, the
+    proof after that, and on KeyboardInterrupt. `dask`: the address of a cluster for the windows of large networks.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.
     """
@@ -44,7 +46,7 @@ def design(
     refuse_hopeless(problem)
     try:
         if method == EXACT:
-            gains = design_exact(problem, budget=Budget(budget), progress=progress)
+            gains = design_exact(problem, budget=Budget(budget), progress=progress, dask=dask)
         else:
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:

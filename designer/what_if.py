@@ -22,6 +22,7 @@ from designer.ladder import percent, rounded_up
 from designer.lmi.back_off import least_gamma
 from designer.model.error_model import StackedGains, error_model, stacked_gains, stacked_links
 from designer.proof.certificate import lyapunov_matrix
+from designer.search.descent import NEAR
 from designer.search.effort import default_method
 from designer.workers import each, greet_cluster
 
@@ -202,7 +203,7 @@ def _design(problem: Problem, method: str, start: StackedGains | None = None) ->
     from designer.synthesis import design
 
     if method == "exact" and start is not None:
-        gains = design_exact(problem, starts={"whole network": start}, near=True)
+        gains = design_exact(problem, starts={"whole network": start}, first=NEAR)
     else:
         gains = design(problem, method=method, budget=math.inf)
     if gains.solver.status.startswith("interrupted"):  # the best gains so far are no price

@@ -44,11 +44,11 @@ ROOMS = {
     "designer.gain": "designer.decay designer.model",
     "designer.proof": "designer.decay",
     "designer.lmi": "designer.gain designer.model designer.proof",
-    "designer.search": "designer.gain designer.lmi designer.model designer.proof",
+    "designer.workers": "",
+    "designer.search": "designer.decay designer.gain designer.lmi designer.model designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "",
     "designer.ladder": "designer.lmi",
-    "designer.workers": "",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
     "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
     "designer.search",

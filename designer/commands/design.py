@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
     "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster "
-    "(default: exact up to 100 nodes, else decomposed)"
+    "(default: exact; decomposed where more than 200 nodes hear too many others to be searched in windows)"
 )
 
 
@@ -48,7 +48,11 @@ def add_design(commands: Subcommands) -> None:
         action="store_true",
         help="no gains, but a table: the certified gamma with each node and each link left out in turn",
     )
-    design.add_argument("--dask", metavar="ADDRESS", help="with --price: the designs run on this Dask cluster")
+    design.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="the designs of --price, or the windows of more than 200 nodes, run on this Dask cluster",
+    )
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     design.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -79,9 +83,9 @@ def design_command(options: argparse.Namespace) -> int:
     problem = _what_is_left(find(options.problem), options.without_node, options.without_link)
     if options.price:
         return _price_command(problem, options)
-    if options.dask is not None:
-        raise InputError("--dask spreads the many designs of --price; a single design runs here")
-    _, result = design_and_save(problem, options.method, options.output, force=options.force, budget=options.budget)
+    _, result = design_and_save(
+        problem, options.method, options.output, force=options.force, budget=options.budget, dask=options.dask
+    )
     print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
 
@@ -100,7 +104,13 @@ def _what_is_left(problem: Problem, nodes: list[str], links: list[str]) -> Probl
 
 
 def design_and_save(
-    problem: Problem, method: str | None, output: Path | None, *, force: bool, budget: float | None = None
+    problem: Problem,
+    method: str | None,
+    output: Path | None,
+    *,
+    force: bool,
+    budget: float | None = None,
+    dask: str | None = None,
 ) -> tuple[Gains, dict[str, Any]]:
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
@@ -114,7 +124,9 @@ def design_and_save(
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
     method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
-    gains = design(problem, method=method, budget=budget, progress=_descent_progress())
+    if dask is not None:
+        _refuse_nothing_to_spread(problem, method)
+    gains = design(problem, method=method, budget=budget, progress=_descent_progress(), dask=dask)
     if gains.solver.status.startswith("out of time"):
         print(
             f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
@@ -138,13 +150,27 @@ def design_and_save(
     }
 
 
+def _refuse_nothing_to_spread(problem: Problem, method: str) -> None:
+    from designer.search.effort import MOST_NODES, in_windows
+
+    if method != "exact" or not in_windows(problem):
+        raise InputError(
+            "--dask spreads the many designs of --price, and the windows in which method exact searches more than "
+            f"{MOST_NODES} nodes; this design runs here"
+        )
+
+
 def _chosen_method(problem: Problem, budget: float | None) -> str:
     """The default for this problem; on stderr why, where it is not the best one or takes long."""
     from designer.search.effort import BUDGET, LONG, MOST_NODES, default_method, in_words, seconds_of_exact
 
     method, seconds, budget = default_method(problem), seconds_of_exact(problem), BUDGET if budget is None else budget
     if method != "exact":
-        print(f"method {method}: there are more than {MOST_NODES} nodes; --method exact asks for it", file=sys.stderr)
+        print(
+            f"method {method}: of more than {MOST_NODES} nodes some hear too many others to be searched in windows; "
+            "--method exact asks for a search of all at once",
+            file=sys.stderr,
+        )
     elif min(seconds, budget) > LONG:
         so_far = f" of about {in_words(seconds)}" if seconds > budget else ""
         print(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.decay import decay
+from designer.decay import Decay, decay
 from designer.gain.products import Collected, Pattern, Products
 from designer.model.error_model import ErrorModel, LinkTerms
 from designer.model.units import natural_scale
@@ -205,27 +205,22 @@ def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: In
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
-def exact_gain(model: ErrorModel, *, above: float | None = None) -> Gain:
-    """The exact gain of an error model, between bounds that differ by 1e-6 of its square where steps suffice.
-
-    `above`: a lower bound of gamma^2, where the search begins.
-    """
+def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
+    """The exact gain of an error model, between bounds that differ by `width` of its square where steps suffice."""
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
-    P, radius = lyapunov(operator)
+    P, decays = lyapunov(operator)
     if P is None:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
-        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, radius)
-    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), above, _WIDTH)
-    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P, radius)
+        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
+    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), width)
+    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P, decays.radius)
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def horizon_gain(
-    operator: Operator, horizon: int, *, width: float = _WIDTH, above: float | None = None
-) -> tuple[float, float]:
+def horizon_gain(operator: Operator, horizon: int, *, width: float = _WIDTH) -> tuple[float, float]:
     """[low, high] around gamma_T^2, of relative width `width`: the recursion fails at low and holds at high."""
-    found = _bracket(operator, horizon, None, above, width)
+    found = _bracket(operator, horizon, None, width)
     return found.low, found.high
 
 
@@ -235,9 +230,7 @@ class _Bracket(NamedTuple):
     horizon: int  # in which the recursion fails at low
 
 
-def _bracket(
-    operator: Operator, horizon: int, invariant: InvariantSet | None, above: float | None, width: float
-) -> _Bracket:
+def _bracket(operator: Operator, horizon: int, invariant: InvariantSet | None, width: float) -> _Bracket:
     """Where the recursion fails, and where it holds.
 
     As g falls to gamma_T^2, the product of all W falls to 0 like (g - gamma_T^2)^p. Three values of g at which the
@@ -245,7 +238,7 @@ def _bracket(
     to its end at some g, the bracket stays wider.
     """
     low, steps, growth, tiny = 0.0, 1, 2.0, float(np.finfo(float).tiny)
-    g = growth * max(_impulse(operator) if above is None else above, tiny)
+    g = growth * max(_impulse(operator), tiny)
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > max(low * (1.0 + 1.001 * width), 2.0 * tiny):
         if not math.isfinite(g):
@@ -301,16 +294,16 @@ def _impulse(operator: Operator) -> float:
     return float(np.linalg.eigvalsh(S_ww).max()) if np.isfinite(S_ww).all() else math.inf
 
 
-def lyapunov(operator: Operator) -> tuple[Array | None, float]:
-    """P(s) that satisfies (17) strictly, (modes, n_eta, n_eta), and the spectral radius of L.
+def lyapunov(operator: Operator) -> tuple[Array | None, Decay]:
+    """P(s) that satisfies (17) strictly, (modes, n_eta, n_eta), and what is known of L.
 
     P0 > 0 with V = P0 - L(P0) > 0 is that of `designer.decay`. By Schur's complement c P0 satisfies (17) if and only if
     I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where floats find no such P0.
     """
     found = decay(operator.corner, len(operator.MM), operator.units)
     if found.total is None or found.rest is None or not found.dies_out:
-        return None, found.radius
-    return _scaled(operator, found.total, found.rest), found.radius
+        return None, found
+    return _scaled(operator, found.total, found.rest), found
 
 
 def _scaled(operator: Operator, P0: Array, V: Array) -> Array:

@@ -71,15 +71,22 @@ def _groups(filled: NDArray[np.bool_]) -> list[Group]:
     if len(filled) <= _SMALL or filled.mean() > _SPARSE:
         return everything
     from scipy import sparse  # takes 0.2 s to import
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     wide = filled.mean(axis=1) > _WIDE
     narrow = np.flatnonzero(~wide)
     shared: Any = sparse.csr_array(filled[narrow][:, filled.mean(axis=0) <= _WIDE].astype(np.float64))
-    order = narrow[reverse_cuthill_mckee(sparse.csr_matrix(shared @ shared.T), symmetric_mode=True)]
+    order = narrow[banded_order(shared @ shared.T)]
     parts = [np.sort(order[k : k + _ROWS]) for k in range(0, len(order), _ROWS)]
     parts += [np.flatnonzero(wide)] if wide.any() else []
     return [Group(_where(rows), _where(np.flatnonzero(filled[rows].any(axis=0)))) for rows in parts]
+
+
+def banded_order(linked: Any) -> Indices:
+    """An order in which what is linked, by a symmetric matrix, is not far apart: reverse Cuthill-McKee."""
+    from scipy.sparse import csr_matrix  # takes 0.2 s to import
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    return np.asarray(reverse_cuthill_mckee(csr_matrix(linked), symmetric_mode=True))
 
 
 def _where(at: Indices) -> Where:

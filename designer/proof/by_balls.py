@@ -17,6 +17,8 @@ from designer.proof.balls import UNDECIDED, Sign, above, below, blocks, diagonal
 class ByBalls:
     """`designer.proof.recursion.Arithmetic`. Y is a matrix of numbers, radius 0, for every mode."""
 
+    cost = 200.0
+
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, *, bits: int) -> None:
         self.bits, self.name = bits, f"ball arithmetic of {bits} bits (flint {flint.__version__})"
         with ctx.workprec(bits):

@@ -23,6 +23,7 @@ class ByFloats:
     """`designer.proof.recursion.Arithmetic`. Y is floats (modes, n_eta, n_eta) on one side of the truth."""
 
     name = f"float64 with a bound on every rounding (numpy {np.__version__})"
+    cost = 1.0
 
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
         with ctx.workprec(_BITS):

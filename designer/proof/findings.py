@@ -73,4 +73,6 @@ def failure(findings: list[Finding], arithmetic: str) -> str | None:
     where, least = f'{first.inequality} fails in mode "{first.mode}"{first.at}', f"{first.sign.least:.3g}"
     if first.sign.refuted:
         return f"{where}: it is false, its least scaled eigenvalue is {least} and must be positive"
+    if first.exhausted:
+        return f"{where}: undecided, and a proof gets no more steps; it takes fewer at a gamma a little larger"
     return f"{where}: it is not proved, its least scaled eigenvalue is about {least}, which {arithmetic} leaves open"

@@ -21,6 +21,8 @@ from designer.proof.findings import Finding, found, proved
 
 Modes = tuple[str, ...]
 MOST_STEPS = 100_000  # designs need fewer even where errors hardly decay
+_FEWEST = 500  # that are taken in networks of any size
+MOST_NUMBERS = 8e9  # of all S(Y) together: about two minutes; at the exact gain itself a recursion has no end
 
 
 class Arithmetic(Protocol):
@@ -32,6 +34,7 @@ class Arithmetic(Protocol):
 
     name: str
     order: int  # of eta
+    cost: float  # of a number of S(Y), beside that of a float
 
     def inequality_17(self, P: Array) -> list[Sign]:
         """diag{P(s), I} - S(P)(s) > 0: minus the matrix of (17)."""
@@ -60,6 +63,7 @@ class Arithmetic(Protocol):
 
 def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, most: int = MOST_STEPS) -> list[Finding]:
     """W > 0 in every mode at each step, and then Y < g P in every mode; or the first that is not proved."""
+    most = min(most, max(_FEWEST, int(MOST_NUMBERS / (arithmetic.cost * len(modes) * arithmetic.order**2))))
     every: list[Finding] = []
     Y, next_look = arithmetic.start(up=True), 0
     for steps in range(most + 1):

@@ -22,20 +22,22 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, horizon_gain, lyapunov, recursion_holds
+from designer.decay import Decay
+from designer.gain.exact import Gain, InvariantSet, exact_gain, horizon_gain, lyapunov, recursion_holds
 from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
 from designer.search.barrier import Barrier
 
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
-_NEAR = 3  # weights that are passed over where the start is near
+NEAR = 9e-4  # the first mu where the start is near
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
 _RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
 _HORIZON = 20
 _LONGEST = 640
-_NUMBERS = 1e8  # that the Y_bar of all steps may be: 0.8 GB
+_NUMBERS = 2e8  # that the Y_bar of all steps may be: 1.6 GB
 _SHORT = 1e-4  # gamma may exceed sqrt(g) by so much of itself, or by this part of mu, before T is doubled
 _SHORT_OF_MU = 0.3
+_COARSE = 1e-3  # of gamma^2, where starts are compared
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _PATIENCE = 10
@@ -73,6 +75,24 @@ def _cost(norm: float, radius: float) -> float:
     return norm / (1.0 - radius) if radius < 1.0 else math.inf
 
 
+def _rank(gain: Gain) -> tuple[float, float]:
+    """The less, the better."""
+    return gain.high, gain.radius
+
+
+class _Stable(NamedTuple):
+    """Mean-square stable gains on the way."""
+
+    v: Array
+    P: Array  # (modes, n_eta, n_eta), satisfies (17)
+    decay: Decay
+
+    @property
+    def cost(self) -> float:
+        """As that of a candidate."""
+        return _cost(float(np.linalg.norm(self.v)), self.decay.radius)
+
+
 class Descent(NamedTuple):
     """What the search found: `chosen` is at most 0.1 % above `least`, and smaller or faster to decay."""
 
@@ -103,15 +123,23 @@ class TimeIsUp(Exception):
     """Ends the search, as Ctrl-C does."""
 
 
+def longest_horizon(problem: Problem) -> int:
+    """The most steps that the search looks over, whether it comes to that or not."""
+    numbers, horizon = len(problem.topologies) * (problem.plant_states + problem.n * problem.nx) ** 2, _HORIZON
+    while 2 * horizon <= _LONGEST and 2 * horizon * numbers <= _NUMBERS:
+        horizon *= 2
+    return horizon
+
+
 def descend(
     problem: Problem,
     starts: Mapping[str, StackedGains],
     *,
-    near: bool = False,
+    first: float = math.inf,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Descent:
-    """The least exact gain found from the best of the given starts; `near`: it is known not to be far from that.
+    """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
     returned.
@@ -119,7 +147,7 @@ def descend(
     search = _Search(problem, Budget() if budget is None else budget, progress)
     ended = "converged"
     try:
-        search.run(starts, _WEIGHTS[_NEAR:] if near else _WEIGHTS)
+        search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:
@@ -132,52 +160,72 @@ def descend(
     return Descent(chosen, least, search.start, search.steps, ended)
 
 
+def follow(problem: Problem, start: StackedGains, weights: tuple[float, ...]) -> StackedGains | None:
+    """Gains from which the barrier falls no further by these weights; None where they are not mean-square stable."""
+    search = _Search(problem, Budget(), None)
+    search.follow(search.barrier.entries.pack(*start), weights)
+    return search.barrier.entries.unpack(search.stable[-1].v) if search.stable else None
+
+
 class _Search:
     """The state of one `descend`, so that it is there when the search is interrupted."""
 
     def __init__(self, problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None) -> None:
         self.problem, self.budget, self.progress = problem, budget, progress
-        self.barrier = Barrier(problem, _HORIZON)
+        self.barrier, self.longest = Barrier(problem, _HORIZON), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
-        self.stable: list[Array] = []  # v of the mean-square stable gains that the weights led to
+        self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
         self.centred: list[Array] = []  # v of ever smaller gains
 
     # the way down
     def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
         """The best start by these weights, on longer horizons while T is too short; then to the centre."""
-        found = {name: self._candidate(self.barrier.entries.pack(*gains)) for name, gains in starts.items()}
-        self.start = min(found, key=lambda name: (found[name].gain.high, found[name].gain.radius))
+        self.start = next(iter(starts))
+        if len(starts) > 1:
+            found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
+            self.start = min(found, key=lambda name: _rank(found[name]))
         v = self.barrier.entries.pack(*starts[self.start])
-        if found[self.start].gain.stable:
-            self.stable.append(v)
+        self._keep(v)
+        x = self.follow(v, weights)
+        if x is not None:
+            self._centre(x)
+
+    def follow(self, v: Array, weights: tuple[float, ...]) -> Array | None:
+        """[v; y] at the end of these weights; None where the search ends before."""
+        self.budget.check()  # before there is a horizon of anything
         x, radius, left = self._begin(v), math.inf, list(weights)
         while left:
             point = self._follow(left[0], x)
             x = point.x
-            operator = self.barrier.operator(x[:-1])
-            P, grows = lyapunov(operator)
-            if P is not None:
-                self.stable.append(x[:-1])
-            elif not self._may_be_longer() or not (self.stable or grows < radius * _SLOWER):
-                return
-            elif self.stable:
-                x = np.append(self.stable[-1], x[-1])
-            radius = min(radius, grows)
-            if P is None or self._is_short(operator, x, P, left[0]):
+            P, decays = self._keep(x[:-1])
+            if P is None:
+                if not self._may_be_longer() or not (self.stable or decays.radius < radius * _SLOWER):
+                    return None
+                if self.stable:
+                    x = np.append(self.stable[-1].v, x[-1])
+                else:
+                    radius = decays.radius
+            if P is None or self._is_short(x, P, left[0]):
                 self.barrier.horizon, self.best = 2 * self.barrier.horizon, None
                 x = self._begin(x[:-1])
             else:
                 left.pop(0)
-        self._centre(x)
+        return x
+
+    def _keep(self, v: Array) -> tuple[Array | None, Decay]:
+        """What `lyapunov` says of gains, which are kept if they are mean-square stable."""
+        P, decays = lyapunov(self.barrier.operator(v))
+        if P is not None:
+            self.stable.append(_Stable(v, P, decays))
+        return P, decays
 
     def _may_be_longer(self) -> bool:
-        numbers = 2 * self.barrier.horizon * len(self.problem.topologies) * self.barrier.size**2
-        return 2 * self.barrier.horizon <= _LONGEST and numbers <= _NUMBERS
+        return 2 * self.barrier.horizon <= self.longest
 
-    def _is_short(self, operator: Operator, x: Array, P: Array, mu: float) -> bool:
+    def _is_short(self, x: Array, P: Array, mu: float) -> bool:
         """Whether the exact gain of these gains is above sqrt(g)."""
-        above = 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
+        operator, above = self.barrier.operator(x[:-1]), 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
         trial = recursion_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
         return trial.holds is False and self._may_be_longer()
 
@@ -249,32 +297,39 @@ class _Search:
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
         """The least gain of all that was found, and the gains to take."""
-        best = [] if self.best is None else [self.best[:-1]]
-        found = [self._candidate(v) for v in (*self.stable[-1:], *best)]
-        if not any(candidate.gain.stable for candidate in found):
-            found += [self._candidate(self.barrier.entries.pack(*gains)) for gains in starts.values()]
-        least = min(found, key=lambda candidate: (candidate.gain.high, candidate.gain.radius))
-        if not least.gain.stable:
-            return least, least
-        near = self._near(least)
-        if not near or min(near)[0] >= least.cost:
-            return least, least
-        return least, self._candidate(near[min(near)])
+        offered = [] if self.best is None else [self.best[:-1]]
+        offered += [each.v for each in self.stable[-1:]]
+        if not self.stable:
+            offered += [self.barrier.entries.pack(*gains) for gains in starts.values()]
+        least = self._candidate(offered[0])
+        for v in offered[1:]:
+            if self._may_be_less(v, least):
+                least = min(least, self._candidate(v), key=lambda candidate: _rank(candidate.gain))
+        near = self._near(least) if least.gain.stable else None
+        return least, least if near is None else self._candidate(near)
 
-    def _near(self, least: Candidate) -> dict[tuple[float, int], Array]:
-        """v of the gains that guarantee _SLACK times the least gamma, by their cost.
+    def _may_be_less(self, v: Array, least: Candidate) -> bool:
+        """Whether no few steps show that the gain is not below this one."""
+        operator, gain = self.barrier.operator(v), least.gain
+        return not gain.stable or recursion_holds(operator, gain.low**2, 2 * gain.horizon).holds is not False
+
+    def _near(self, least: Candidate) -> Array | None:
+        """v of the gains of least cost that guarantee _SLACK times the least gamma; None where none cost less.
 
         They are sought among the last of the centred ones and every tenth before it: the last alone would not do, for
         what grows too slowly to be seen within T steps, centring lets grow.
         """
-        near: dict[tuple[float, int], Array] = {}
-        for v in (*self.centred[::-10], *self.stable):
-            operator = self.barrier.operator(v)
-            P, radius = lyapunov(operator)
-            g = (_SLACK * least.gain.high) ** 2
-            if P is not None and recursion_holds(operator, g, _LONG, invariant=InvariantSet(P)).holds:
-                near[_cost(float(np.linalg.norm(v)), radius), len(near)] = v
-        return near
+        offered = list(self.stable)
+        for v in self.centred[::-10]:
+            P, decays = lyapunov(self.barrier.operator(v))
+            offered += [] if P is None else [_Stable(v, P, decays)]
+        near = [each for each in offered if self._holds(each, _SLACK * least.gain.high)]
+        best = min(near, key=lambda each: each.cost, default=None)
+        return None if best is None or best.cost >= least.cost else best.v
+
+    def _holds(self, stable: _Stable, gamma: float) -> bool:
+        operator, invariant = self.barrier.operator(stable.v), InvariantSet(stable.P)
+        return recursion_holds(operator, gamma**2, _LONG, invariant=invariant).holds is True
 
     def _candidate(self, v: Array) -> Candidate:
         K_bar, H_bar = self.barrier.entries.unpack(v)

@@ -1,7 +1,8 @@
 """What the search for the least exact gain takes, estimated before it begins: what the default method depends on.
 
-The time is that of about a thousand gradients, and a gradient costs a bit and, for large networks, what it takes to
-pass over Y_bar. To the end of the search, which a budget may come before.
+The time is that of many gradients, and a gradient costs a bit and, for large networks, what it takes to pass over
+Y_bar. How many it takes depends on more than can be known beforehand: docs/theory.md, section 6, says how far off the
+estimate was. It is of the whole search, whose end a budget may come before.
 """
 
 from __future__ import annotations
@@ -11,36 +12,62 @@ from pathlib import Path
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
+from designer.search.descent import longest_horizon
+from designer.search.windows import windows
 
-MOST_NODES = 100  # up to which exact is the default: as far as it was measured to its end
+MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
 BUDGET = 600.0  # seconds
 LONG = 60.0  # worth a word beforehand
-_GRADIENTS = 1000
+_GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
+_MORE = 2.65  # times as many of large networks
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
-_MATRICES = 70  # as large as Y_bar that the search keeps at once: the horizon, and what it works on
+_WORK = 50  # matrices as large as Y_bar that the search keeps beside those of the horizon
+_WORK_OF_WINDOWS = 25  # and without a search of the whole: starts, exact gain and proof
 _OTHERS = 2e8  # bytes, whatever the size
 
 
 def default_method(problem: Problem, *, designs: float = 1.0) -> str:
-    """ "exact" up to 100 nodes, and of many designs where they take the default budget together at most."""
-    small = problem.n <= MOST_NODES and (designs == 1.0 or designs * seconds_of_exact(problem) <= BUDGET)
-    return "exact" if small else "decomposed"
+    """ "exact", but for large networks without windows, and for many designs that take more than the default budget."""
+    if designs > 1.0:
+        return "exact" if designs * seconds_of_exact(problem) <= BUDGET else "decomposed"
+    return "exact" if problem.n <= MOST_NODES or in_windows(problem) else "decomposed"
+
+
+def in_windows(problem: Problem) -> bool:
+    """Whether the network is searched in windows before it is searched at once."""
+    return problem.n > MOST_NODES and bool(windows(problem))
 
 
 def seconds_of_exact(problem: Problem) -> float:
     """Estimated processor time of method "exact" without a budget."""
-    return _GRADIENTS * (_OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem))
+    return gradients_of_exact(problem) * (_OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem))
+
+
+def gradients_of_exact(problem: Problem) -> float:
+    """Estimated number of gradients over 20 steps; one over 40 counts twice."""
+    return _GRADIENTS * min(max(problem.n / 6.0, 1.0), _MORE)
+
+
+def whole_fits(problem: Problem, *, free: float | None = None) -> bool:
+    """Whether there is memory to search the whole network at once; `free` in bytes, or as the system says."""
+    return _bytes_of_whole(problem) <= (_free_memory() if free is None else free)
 
 
 def refuse_without_memory(problem: Problem, *, free: float | None = None) -> None:
     """InputError where the search needs more memory than is free; `free` in bytes, or as the system says."""
-    needed, free = _OTHERS + 8.0 * _MATRICES * _numbers(problem), _free_memory() if free is None else free
+    needed, free = _bytes_of_whole(problem), _free_memory() if free is None else free
+    if in_windows(problem):
+        needed = min(needed, _OTHERS + 8.0 * _WORK_OF_WINDOWS * _numbers(problem))
     if needed > free:
         raise InputError(
             f"{problem.name}: method exact needs about {needed / 1e9:.1f} GB of memory for {problem.n} nodes and "
             f"{len(problem.topologies)} modes, and {free / 1e9:.1f} GB are free; --method decomposed needs less"
         )
+
+
+def _bytes_of_whole(problem: Problem) -> float:
+    return _OTHERS + 8.0 * (longest_horizon(problem) + _WORK) * _numbers(problem)
 
 
 def in_words(seconds: float) -> str:

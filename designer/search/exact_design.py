@@ -12,7 +12,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
-from designer.gain.exact import Gain, exact_gain
+from designer.gain.exact import Gain, Operator, exact_gain, lyapunov
 from designer.gain.floor import floor
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
@@ -20,8 +20,11 @@ from designer.model.error_model import StackedGains, error_model, link_gains, st
 from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, Prover
 from designer.search.descent import Budget, Descent, Progress, descend
-from designer.search.effort import refuse_without_memory
+from designer.search.effort import in_windows, refuse_without_memory, whole_fits
 from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
+from designer.search.windows import WEIGHT as WEIGHT_OF_WINDOWS
+from designer.search.windows import window_gains
+from designer.workers import greet_cluster
 
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
@@ -35,22 +38,26 @@ def design_exact(
     problem: Problem,
     *,
     starts: Mapping[str, StackedGains] | None = None,
-    near: bool = False,
+    first: float = math.inf,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
+    dask: str | None = None,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
-    `near`: the starts are near the least gain. KeyboardInterrupt ends the search, and so does the end of the budget,
-    which begins when it is made; the best so far is returned.
+    `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
+    when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
     """
-    started = time.perf_counter()
+    started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
+    if dask is not None:
+        greet_cluster(dask)  # before the starts, which may take minutes
     if math.isinf(floor(problem)):
         raise Unattainable(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
             "the plant that the disturbance drives; measure it"
         )
+    own = starts is None
     starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
     lmi_exact = next(
         (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
@@ -58,7 +65,10 @@ def design_exact(
     if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
-    descent = descend(problem, starts, near=near, budget=budget, progress=progress)
+    if own and in_windows(problem):
+        descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
+    else:
+        descent = descend(problem, starts, first=first, budget=budget, progress=progress)
     solved = time.perf_counter()
     chosen = descent.chosen
     if not chosen.gain.stable:
@@ -96,10 +106,31 @@ def design_exact(
     )
 
 
+def _by_windows(
+    problem: Problem,
+    starts: Mapping[str, StackedGains],
+    *,
+    budget: Budget,
+    progress: Callable[[Progress], None] | None,
+    dask: str | None,
+) -> Descent:
+    """Windows first, from which the whole network's search goes on where there are time and memory for it."""
+    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask)
+    ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
+    descent = descend(
+        problem,
+        {"windows": windowed.gains},
+        first=WEIGHT_OF_WINDOWS,
+        budget=Budget(0.0) if ended else budget,
+        progress=progress,
+    )
+    return descent._replace(ended=ended) if ended else descent
+
+
 def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
     starts = {"least variance": least_variance_gains(problem)}
-    if not exact_gain(error_model(problem, *starts["least variance"])).stable:
+    if lyapunov(Operator(error_model(problem, *starts["least variance"])))[0] is None:
         starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
     if problem.n * problem.nx > _LMI_STATES:
         return starts, None

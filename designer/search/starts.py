@@ -25,6 +25,7 @@ from designer.search.entries import Entries
 
 WEIGHT = 0.4  # of the neighbours' estimates together
 _MOST_STEPS = 1000
+_MOST_DOUBLINGS = 60  # 2^60 steps
 _STEPS_OF_NETWORK = 300
 _SETTLED_NETWORK = 1e-6
 _RESTARTS = 0.01  # so that a mode that the chain leaves for ever has gains of its own too
@@ -84,11 +85,16 @@ def _predictor_gain(problem: Problem, i: int, heard: tuple[int, ...], spread: Ar
 
 
 def _plant_covariance(problem: Problem) -> Array:
-    """X = A X A' + B B': where white w keeps the plant; the sum by doubling, A is stable."""
+    """X = A X A' + B B': where white w keeps the plant; the sum by doubling, A is stable.
+
+    Near radius 1 that overflows, or A does not decay as it is rounded: what there is before is as good a guess.
+    """
     power, X = problem.plant.A, problem.plant.B @ problem.plant.B.T
-    while np.abs(power).max() > 1e-12:
-        X = X + power @ X @ power.T
-        power = power @ power
+    for _ in range(_MOST_DOUBLINGS):
+        X_next = X + power @ X @ power.T
+        if np.abs(power).max() <= 1e-12 or not np.abs(X_next).max() < _BOUNDLESS:
+            break
+        X, power = X_next, power @ power
     return np.asarray(X)
 
 

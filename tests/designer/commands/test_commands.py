@@ -15,7 +15,7 @@ from designer.cli import main
 from designer.lmi.lmi_design import METHODS
 from designer.problems import names
 from designer.reproduce import EXAMPLES, Reproduced
-from designer.search import effort
+from designer.search import effort, windows
 from designer.synthesis import EXACT
 
 
@@ -101,12 +101,18 @@ def test_a_key_that_is_there_twice_is_refused(
 def test_the_default_of_a_large_problem(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where there are too many nodes the decomposed LMI is solved, and one sentence says so."""
+    """It is searched in windows; where these are too large the decomposed LMI is solved, and a sentence says so."""
     monkeypatch.setattr(effort, "MOST_NODES", 1)
-    assert run("design", "two-nodes", "-o", "gains.json", "--json") == 0
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    assert capsys.readouterr().out.startswith("two-nodes by exact: gamma = 1.414")
+    monkeypatch.setattr(windows, "_MOST", 1)
+    assert run("design", "two-nodes", "-o", "gains.json", "--force", "--json") == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["method"] == "decomposed"
-    assert printed.err == "method decomposed: there are more than 1 nodes; --method exact asks for it\n"
+    assert printed.err == (
+        "method decomposed: of more than 1 nodes some hear too many others to be searched in windows; --method exact "
+        "asks for a search of all at once\n"
+    )
 
 
 def test_what_there_is_when_time_is_over_is_certified(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -330,7 +336,7 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
     assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
     assert not Path("never.json").exists()
     for words, sentence in {
-        ("--dask", "tcp://127.0.0.1:1"): "--dask spreads the many designs of --price",
+        ("--dask", "tcp://127.0.0.1:1"): "--dask spreads the many designs of --price, and the windows",
         ("--price", "--dask", "tcp://127.0.0.1:1"): "no Dask scheduler answers at tcp://127.0.0.1:1: ",
         ("--price", "-o", "never.json"): "--price writes no gains file",
         ("--without-link", "left"): "--without-link left: a link is A:B",

@@ -234,7 +234,7 @@ def test_a_search_whose_sweeps_end_too_soon_leaves_its_interval_wider_and_true(c
     model = error_model(*case)
     operator, gain = Operator(model), exact_gain(model)
     assert gain.P is not None
-    found = exact._bracket(operator, 10, InvariantSet(gain.P), None, 1e-6)
+    found = exact._bracket(operator, 10, InvariantSet(gain.P), 1e-6)
     assert found.low <= gain.high**2
     assert gain.low**2 <= found.high < math.inf
     assert found.high > 1.0001 * found.low

@@ -230,8 +230,13 @@ def test_a_mutant_that_breaks_17_is_proved_false(
 
 @every_arithmetic
 @every_network
-def test_a_horizon_that_is_too_short_is_not_proved(network: str, makes: Sequence[Make]) -> None:
-    """With one step fewer than it takes, nothing is known of the rest; with as many, it is proved as without any."""
+def test_a_horizon_that_is_too_short_is_not_proved(
+    network: str, makes: Sequence[Make], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With one step fewer than it takes, nothing is known of the rest; with as many, it is proved as without any.
+
+    Nor is it where the size of the network admits no more.
+    """
     gains = ALL[network, "exact"]
     problem, P = gains.problem, lyapunov_matrix(gains)
     by = makes[0](problem, gains.K, gains.H)
@@ -245,7 +250,15 @@ def test_a_horizon_that_is_too_short_is_not_proved(network: str, makes: Sequence
         verdict = verify(gains.model_copy(update={"certificate": claim}), makes=makes)
         assert verdict.holds is holds
         assert holds or "Y < g P fails in mode" in str(verdict.failure)
-        assert holds or f"after {horizon} steps, and in none before: it is not proved" in str(verdict.failure)
+        assert holds or f"after {horizon} steps, and in none before: undecided" in str(verdict.failure)
+    monkeypatch.setattr(recursion_module, "_FEWEST", 1)
+    monkeypatch.setattr(
+        recursion_module, "MOST_NUMBERS", by.cost * len(problem.topologies) * by.order**2 * (steps - 0.5)
+    )
+    assert verify(gains, makes=makes).failure == (
+        f'Y < g P fails in mode "{problem.mode_names[0]}" after {steps - 1} steps, and in none before: undecided, and '
+        "a proof gets no more steps; it takes fewer at a gamma a little larger"
+    )
     with pytest.raises(InputError, match="horizon is 0"):
         verify(mutated(gains, lambda document: document["certificate"].update(horizon=0)))
 

@@ -15,10 +15,11 @@ from designer.model.error_model import error_model
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
-from designer.search import descent, exact_design
+from designer.search import descent, effort, exact_design
 from designer.search.descent import Budget
 from designer.search.exact_design import design_exact
 from designer.search.starts import least_variance_gains
+from designer.search.windows import Windowed
 from designer.synthesis import design
 
 
@@ -98,3 +99,21 @@ def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
     assert proved.floor == floor(problem)
     assert proved.by_theorem1 is not None
     assert proved.floor <= proved.exact[1] <= proved.gamma * (1.0 + 1e-6) <= proved.by_theorem1 * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("why", ["interrupted", "out of time", "windows alone, for want of memory", "converged"])
+def test_what_windows_led_to_is_certified_whatever_ends_the_search(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And where nothing ends it, a search of the whole network goes on from there."""
+    problem = find("two-nodes")
+    start = least_variance_gains(problem)
+    monkeypatch.setattr(effort, "MOST_NODES", 1)
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:3])
+    ended = why if why in ("interrupted", "out of time") else None
+    if ended is not None:
+        monkeypatch.setattr(exact_design, "window_gains", lambda *_, **__: Windowed(start, ended))
+    if "memory" in why:
+        monkeypatch.setattr(exact_design, "whole_fits", lambda problem: False)
+    gains = design_exact(problem)
+    assert gains.solver.status.startswith(f"{why}; from ")
+    assert (gains.solver.iterations > 0) == (why == "converged")
+    assert verify(gains).holds
