@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
 
-from agent.commands import roles, run
+from agent.commands import keys, roles, run
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_INPUT, EXIT_INTERRUPTED, PeakmeshError
 
 
@@ -21,18 +21,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="peakmesh", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     run.add_run(commands)
-    roles.add_roles(commands, {} if "--child" in words else os.environ)  # a launcher says all to its children
-    return perform(parser.parse_args(words))
-
-
-def open_streams() -> None:
-    """Where a standard stream was closed, open it to nowhere: else the next file opened would be taken for it."""
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
-            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115 -- for good
+    roles.add_roles(commands)
+    keys.add_keys(commands)
+    return perform(parser.parse_args(arguments))
 
 
 def perform(options: argparse.Namespace) -> int:

@@ -39,14 +39,18 @@ def launch(
     wait: float,
     report: Callable[[dict[str, Any]], None],
     recording_plan: RecordingPlan | None = None,
+    keys: Path | None = None,
 ) -> dict[str, Any]:
     """Run everything on this machine; returns the coordinator's summary. `report` gets its words as they come.
+
+    With `keys`, a folder of certificates, nobody else can take part.
 
     Raises what the run ended with: RunBroken, Interrupted, or InputError. No process is left behind. A run that went
     on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
     began = time.time()
-    common = [str(gains_path), "--run", run, "--wait", str(wait), "--deadline", str(plan.deadline), "--child"]
+    common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
+    common += ["--keys", str(keys)] if keys is not None else []
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
     commands |= {node_who(name): ["node", "--node", name, *common] for name in gains.problem.node_names}
     if not plan.needs_no_plant(gains.problem):

@@ -19,6 +19,7 @@ from designer.commands import (
     design,
     export,
     identify,
+    keys,
     recordings,
     recover,
     report,
@@ -57,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     show.add_show(commands)
     add_roles(commands)
     watch.add_watch(commands)
+    keys.add_keys(commands)
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help(sys.stderr)

@@ -30,11 +30,13 @@ ROOMS = {
     "agent.receipts": "",
     "agent.signals": "",
     "agent.network": "agent.plan agent.signals",
+    "agent.authority": "agent.network",
     "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.inbox agent.network "
     "agent.pacing agent.plan agent.product agent.receipts agent.signals",
     "agent.children": "",
     "agent.launch": "agent.children agent.contract.recording agent.plan agent.signals",
-    "agent.commands": "agent.contract.recording agent.faults agent.launch agent.network agent.plan agent.roles",
+    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.launch agent.network agent.plan "
+    "agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",
@@ -76,6 +78,7 @@ ROOMS = {
 # Each outside thing behind as few doors as can be.
 DOORS = {
     "zenoh": ["agent/network/session.py"],
+    "cryptography": ["agent/authority.py"],
     "foxglove": ["agent/roles/viewer.py"],
     "mcap": ["agent/contract/recording/"],
     "zstandard": ["agent/contract/recording/"],
@@ -294,7 +297,7 @@ def loaded(modules: str) -> set[str]:
     [
         # a node: no solver, no pictures, no recorder
         ("agent.cli, agent.network.bus, agent.roles.joining, agent.roles.node",
-         "cvxpy clarabel scipy designer matplotlib rich mcap zstandard"),
+         "cvxpy clarabel scipy designer matplotlib rich mcap zstandard cryptography"),
         ("agent.cli, agent.network.bus, agent.roles.plant, agent.roles.coordinator",
          "cvxpy clarabel scipy designer matplotlib rich mcap zstandard"),
         ("agent.cli, agent.launch", "cvxpy clarabel scipy designer matplotlib rich mcap zenoh"),

@@ -28,8 +28,7 @@ from agent.commands.options import (
     recording_plan_of,
     run_name,
 )
-from agent.commands.supervisor import tell_supervisor
-from agent.commands.variables import Repeated, heed_variables
+from agent.commands.security import add_security_options, credentials_of, default_listen, is_loopback, refuse_insecure
 from agent.commands.words import say_broken_off, say_to_launcher, say_to_person
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, InputError, RunBroken
 
@@ -83,10 +82,8 @@ def add_network_options(
     parser.add_argument("--run", type=run_name, metavar="NAME", help=run)
     parser.add_argument(
         "--listen",
-        default="tcp/127.0.0.1:0",
         metavar="ADDRESS",
-        help="where to be reached (tcp/127.0.0.1:0; port 0 takes a free one), or none: by nobody, everything goes "
-        "through the one that --connect names",
+        help="where to be reached (tcp/127.0.0.1:0, with --keys tls/127.0.0.1:0; port 0 takes a free one)",
     )
     parser.add_argument(
         "--connect",
@@ -97,6 +94,7 @@ def add_network_options(
         "multicast, for everybody, where it is to be found on the local network",
     )
     parser.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
+    add_security_options(parser)
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--sockets", type=Path, help=argparse.SUPPRESS)  # of a run on one machine, a folder
 
@@ -129,9 +127,9 @@ def coordinator_command(options: argparse.Namespace) -> int:
     gains = load_gains(options.gains)
     plan = plan_of(options, gains)
     say = say_to_launcher if options.child else say_to_person
-    with Bus(_place(options, gains, COORDINATOR), run=options.run or gains.problem.name, who=COORDINATOR) as bus:
-        say({"listening": bus.locators() or list(options.connect)})
-        _tell_supervisor(options, "the coordinator waits for everybody")
+    run = options.run or gains.problem.name
+    with Bus(_place(options, gains, COORDINATOR), run=run, who=COORDINATOR) as bus:
+        say({"listening": bus.locators()})
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
     return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
@@ -156,11 +154,17 @@ def recorder_command(options: argparse.Namespace) -> int:
 
 def live_command(options: argparse.Namespace) -> int:
     """`peakmesh live GAINS`: looks on, and takes no part."""
+    from agent.contract.keys import VIEWER
     from agent.roles import viewer
 
     gains = load_gains(options.gains)
+    if not (options.insecure or is_loopback(options.host)):
+        raise InputError(
+            f"--host {options.host}: others could look on, for Foxglove is sent everything in the clear; "
+            "--insecure lets them"
+        )
     viewer.run(
-        network_of(options),
+        network_of(options, VIEWER, gains),
         gains,
         run=options.run or gains.problem.name,
         host=options.host,
@@ -212,18 +216,20 @@ def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
     from agent.contract.keys import COORDINATOR
     from agent.network.links import sockets
 
-    network = network_of(options)
+    network = network_of(options, who, gains)
     if options.sockets is None:
         return network
     listen = network.listen if who == COORDINATOR else ""
     return replace(network, listen=listen, sockets=sockets(gains.problem, who, options.sockets))
 
 
-def network_of(options: argparse.Namespace) -> Network:
-    """What the options of `add_network_options` ask for."""
-    from agent.network.addresses import NONE, refuse_addresses
+def network_of(options: argparse.Namespace, who: str, gains: Gains | None) -> Network:
+    """What the options of `add_network_options` ask for, of `who`; without `gains` it believes every certificate."""
     from agent.network.configuration import Network
 
+    problem = gains.problem if gains is not None else None
+    credentials = credentials_of(options, who, problem)
+    listen = options.listen or default_listen(options)
     connect = tuple(options.connect)
     if options.child:
         if options.command != "coordinator" and options.sockets is None:
@@ -233,9 +239,12 @@ def network_of(options: argparse.Namespace) -> Network:
         threading.Thread(target=_stop_with_launcher, daemon=True).start()
     elif not connect and (options.command != "coordinator" or options.listen == NONE):
         raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
-    refuse_addresses(listen=options.listen, connect=connect)
-    deadline = options.deadline if "deadline" in options else 0.0  # a viewer's own patience is nobody's concern
-    return Network(options.listen, connect, options.wait, lease=max(LEAST_LEASE, 2.0 * deadline))
+    for option, addresses in (("--listen", (listen,)), ("--connect", connect)):
+        for address in addresses:
+            if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
+                raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
+            refuse_insecure(option, address, keys=options.keys, insecure=options.insecure)
+    return Network(listen, connect, options.wait, problem=problem, credentials=credentials)
 
 
 def _stop_with_launcher() -> None:

@@ -21,6 +21,7 @@ from agent.commands.options import (
     positive,
     recording_plan_of,
 )
+from agent.commands.security import add_keys_option
 from agent.commands.words import progress, run_text
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD
 
@@ -44,6 +45,7 @@ def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] 
     parser.add_argument(
         "--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for all to start (60)"
     )
+    add_keys_option(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -71,7 +73,8 @@ def run_gains(
     run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
     refuse_recording(recording, force=options.force)
-    with progress(plan.steps, live=f"peakmesh live {path} --run {run}") as report:
+    keys = "" if options.keys is None else f" --keys {options.keys}"
+    with progress(plan.steps, live=f"peakmesh live {path} --run {run}{keys}") as report:
         summary = launch(
             path,
             gains,
@@ -82,6 +85,7 @@ def run_gains(
             wait=options.wait,
             report=report,
             recording_plan=recording_plan,
+            keys=options.keys,
         )
     parts = [str(part) for part in files_of(recording)]
     return {"recording": str(recording), "parts": parts, "run": run, "seed": plan.seed, **summary}

@@ -6,10 +6,14 @@ import secrets
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from agent.network.addresses import MULTICAST, NONE
+from agent.contract.problem import Problem
+from agent.contract.sizes import largest
+from agent.network.access import access_control
+from agent.network.credentials import Credentials
 from agent.network.links import Sockets
 
-ATTEMPT_MS = 500  # that a client tries to connect before it looks up
+LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
+ENVELOPE = 4096  # bytes of Zenoh's own around the largest message: its key, its time, its encoding
 BUFFER = 16_384  # bytes, of each direction of each link; messages are small, links are many
 MANY = 1000  # more than anybody has links
 
@@ -29,6 +33,18 @@ class Network:
     lease: float = 20.0  # seconds
     routes: bool = False  # takes no part, but passes on what others say
     sockets: Sockets | None = None
+    problem: Problem | None = None  # of the run; where it is known, nothing comes in that is larger than it can have
+    credentials: Credentials | None = None  # with them everybody must show some; what they allow is in the problem
+
+    @property
+    def largest(self) -> int | None:
+        """Bytes that a message can have; None where that is not known."""
+        return largest(self.problem) if self.problem is not None else None
+
+    def refusal(self) -> str:
+        """Why nobody to whom it connects is reached, where certificates are the reason; otherwise ""."""
+        own = self.credentials
+        return next(filter(None, map(own.why_not, self.connect)), "") if own is not None else ""
 
     @property
     def kind(self) -> Literal["peer", "client", "router"]:
@@ -36,8 +52,8 @@ class Network:
         return "router" if self.routes else "client" if self.listen == NONE else "peer"
 
 
-def zenoh_configuration(network: Network) -> dict[str, Any]:
-    """One known address is enough: gossip makes the mesh of the peers.
+def zenoh_configuration(network: Network, *, run: str) -> dict[str, Any]:
+    """Peer mode without multicast: one known address is enough, gossip makes the mesh.
 
     Peers connect in the background, so that a signal is heeded meanwhile; the barrier waits for everybody.
     """
@@ -66,7 +82,39 @@ def zenoh_configuration(network: Network) -> dict[str, Any]:
     }
     if network.sockets is not None:
         _keep_to(network.sockets, configuration, listen=[network.listen] if network.listen else [])
+    if network.largest is not None:
+        _let_in_no_larger(network.largest, configuration)
+    if network.credentials is not None:
+        configuration["transport"]["link"] |= {"protocols": ["tls"], "tls": _tls(network.credentials)}
+        if network.problem is not None and run:
+            configuration["access_control"] = access_control(network.problem, run=run)
     return configuration
+
+
+def _let_in_no_larger(size: int, configuration: dict[str, Any]) -> None:
+    """Nor gather the parts of what is larger."""
+    configuration["transport"]["link"]["rx"]["max_message_size"] = size + ENVELOPE
+    configuration["low_pass_filter"] = [
+        {
+            "id": "largest",
+            "flows": ["ingress"],
+            "messages": ["put", "delete", "query", "reply"],
+            "key_exprs": ["**"],
+            "size_limit": size,
+        }
+    ]
+
+
+def _tls(credentials: Credentials) -> dict[str, Any]:
+    """Mutual: both ends show a certificate. Its name is a role, not an address, and decides what its owner may do."""
+    own = {"private_key": str(credentials.private), "certificate": str(credentials.certificate)}
+    return {
+        "root_ca_certificate": str(credentials.authority),
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+        "close_link_on_expiration": True,
+        **{f"{side}_{what}": path for side in ("listen", "connect") for what, path in own.items()},
+    }
 
 
 def _keep_to(sockets: Sockets, configuration: dict[str, Any], *, listen: list[str]) -> None:

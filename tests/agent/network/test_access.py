@@ -1,0 +1,272 @@
+"""Whoever has a certificate may say, hear, show, see, answer and ask what the contract lets them, and nothing else.
+
+Every participant of a run is a session here that shows whatever its access control lets through. An attacker with the
+certificate of one of them tries everything, on every key.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import zenoh
+from attackers import PATIENCE, configuration, wait_for_listeners
+
+from agent.authority import Authority
+from agent.contract.gains import Gains
+from agent.contract.keys import RECORDER, VIEWER, key, participants, replay
+from agent.contract.problem import Problem
+from agent.contract.rights import Rights, everybody, rights
+from agent.network import configuration as ours
+from agent.network.access import access_control
+from agent.network.configuration import Network
+from agent.network.credentials import Credentials
+from agent.network.session import Session
+
+RUN, OTHER = "attacked", "peakmesh/other/mode"
+BLOCK, NONE = zenoh.CongestionControl.BLOCK, zenoh.ConsolidationMode.NONE
+ATTACK, HONEST = "attack", "honest"  # payloads
+
+
+@pytest.fixture(scope="module")
+def keys(pair: Gains, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates for everybody."""
+    folder = tmp_path_factory.mktemp("keys")
+    Authority.create(folder, pair.problem.name, days=1).issue(everybody(pair.problem), days=1)
+    return folder
+
+
+def marker(who: str) -> str:
+    """The only key that tests add: where it has come to `who`, all that was sent before it has come or was dropped."""
+    return f"marker/{who}"
+
+
+def with_markers(problem: Problem, *, run: str) -> dict[str, Any]:
+    """The access control of the program, which lets markers through too, and does not hide what the test listens to."""
+    control = access_control(problem, run=run)
+    for flow, messages, keys in (
+        ("ingress", ["put", "declare_subscriber"], marker("*")),
+        ("egress", ["put"], marker("*")),
+        ("egress", ["declare_subscriber", "declare_liveliness_subscriber"], "**"),
+    ):
+        name = f"test {flow} {messages[0]}"
+        rule = {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": [keys]}
+        control["rules"].append(rule)
+        for policy in control["policies"]:
+            policy["rules"].append(name)
+    return control
+
+
+class Reached(NamedTuple):
+    """What got through."""
+
+    said: set[tuple[str, str]]  # by the attacker: to whom, on which key
+    shown: set[tuple[str, str]]  # the attacker's tokens: to whom, which
+    heard: set[str]  # of the others, by the attacker: keys
+    seen: set[str]  # of their tokens
+    answered: set[str]  # by the attacker, to the recorder: keys
+    asked: set[str]  # by the attacker, of the others, with an answer
+
+
+class Peers:
+    """Everybody of a run, and what reaches them."""
+
+    def __init__(self, problem: Problem, keys: Path, stack: ExitStack) -> None:
+        self.rights = rights(problem, run=RUN)
+        self.names, self.arrived = participants(problem), set[tuple[str, str, str]]()
+        self.seen = set[tuple[str, str]]()
+        self.sessions: dict[str, zenoh.Session] = {}
+        self.address = ""
+        for who in self.names:
+            connect = (self.address,) if self.address else ()
+            network = Network("tls/127.0.0.1:0", connect, problem=problem, credentials=Credentials(keys, who))
+            session = Session(network, run=RUN, who=who, hand_over=lambda duty: None)
+            stack.enter_context(closing(session))
+            self.sessions[who] = session._zenoh
+            self.address = self.address or session.locators()[0]
+            self._listen(who, session)
+
+    def _listen(self, who: str, session: Session) -> None:
+        def take(sample: zenoh.Sample) -> None:
+            kind = "" if sample.kind == zenoh.SampleKind.PUT else "delete "
+            if sample.payload.to_string() != HONEST:
+                self.arrived.add((who, f"{kind}{sample.key_expr}", sample.payload.to_string()))
+
+        def see(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self.seen.add((who, str(sample.key_expr)))
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply(query.key_expr, HONEST)
+
+        opened, live = self.sessions[who], self.sessions[who].liveliness()
+        session._declared += [
+            opened.declare_queryable(key(RUN, replay(who)), answer),
+            live.declare_subscriber("**", see),
+            *(opened.declare_subscriber(expression, take) for expression in ("peakmesh/**", marker(who))),
+        ]
+
+
+def concrete(expressions: list[str]) -> list[str]:
+    return [expression.replace("*", "x") for expression in expressions]
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@contextmanager
+def peers(problem: Problem, keys: Path) -> Iterator[Peers]:
+    with ExitStack() as stack:
+        yield Peers(problem, keys, stack)
+
+
+class Attack:
+    """With the certificate of `who`."""
+
+    def __init__(self, peers: Peers, keys: Path, who: str, stack: ExitStack) -> None:
+        self._peers, everybody_has = peers, list(peers.rights.values())
+        self._says = sorted({key for each in everybody_has for key in concrete(each.says)})
+        self._hears = sorted({key for each in everybody_has for key in each.hears})
+        self._shows = sorted({key for each in everybody_has for key in concrete(each.shows)})
+        self._sees = sorted({key for each in everybody_has for key in each.sees})
+        self._answers = sorted({key for each in everybody_has for key in each.answers})
+        self._marked = threading.Semaphore(0)
+        self._session = stack.enter_context(zenoh.open(configuration(peers.address, keys, who)))
+        wait_for_listeners(self._session, map(marker, peers.names))
+        self._session.declare_subscriber(marker("attacker"), lambda sample: self._marked.release())
+
+    def all(self) -> Reached:
+        said, shown = self.speak()
+        heard, seen, asked = self.spy()
+        return Reached(said, shown, heard, seen, self.answer(), asked)
+
+    def speak(self) -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
+        """Publish, delete and show tokens on every key: what reaches whom."""
+        self._peers.arrived.clear()
+        self._peers.seen.clear()
+        tokens = [self._session.liveliness().declare_token(token) for token in self._shows]
+        for expression in (*self._says, OTHER):
+            self._session.put(expression, ATTACK, congestion_control=BLOCK)
+            self._session.delete(expression)
+        self._there_and_back()
+        said = {(name, key) for name, key, _ in self._peers.arrived if not key.startswith(marker(""))}
+        shown = set(self._peers.seen)
+        for token in tokens:
+            token.undeclare()  # type: ignore[no-untyped-call]
+        return said, shown
+
+    def spy(self) -> tuple[set[str], set[str], set[str]]:
+        """Listen on every key and pattern, and ask everybody everything: which messages, tokens and answers."""
+        heard, seen, asked = set[str](), set[str](), set[str]()
+
+        def hear(sample: zenoh.Sample) -> None:
+            if sample.payload.to_string() == HONEST and str(sample.key_expr) != marker("attacker"):
+                heard.add(str(sample.key_expr))
+
+        with ExitStack() as honest:
+            for name, peer in self._peers.sessions.items():
+                for token in concrete(self._peers.rights[name].shows):
+                    honest.enter_context(peer.liveliness().declare_token(token))
+            for expression in ("**", *self._hears, *self._says):
+                self._session.declare_subscriber(expression, hear)
+            for expression in ("**", *self._sees):
+                self._session.liveliness().declare_subscriber(
+                    expression, lambda sample: seen.add(str(sample.key_expr)), history=True
+                )
+            for question in self._answers:
+                self._session.get(question, lambda reply: asked.add(str(reply.ok.key_expr)))
+            self._there_and_back()
+        return heard, seen, asked
+
+    def answer(self) -> set[str]:
+        """Answer the recorder in everybody's name, with messages of everybody: what it takes."""
+
+        def lie(query: zenoh.Query) -> None:
+            with query:
+                for expression in self._says:
+                    query.reply(expression, ATTACK)
+
+        for question in self._answers:
+            self._session.declare_queryable(question, lie)
+        self._there_and_back()
+        taken = set[str]()
+        for question in self._answers:
+            for reply in self._peers.sessions[RECORDER].get(
+                f"{question}?_anyke", target=zenoh.QueryTarget.ALL, consolidation=NONE, timeout=PATIENCE
+            ):
+                if reply.ok is not None and reply.ok.payload.to_string() == ATTACK:
+                    taken.add(str(reply.ok.key_expr))
+        return taken
+
+    def _there_and_back(self) -> None:
+        """Until everything sent so far has come to everybody, and what everybody says has come back."""
+        for name in self._peers.names:
+            self._session.put(marker(name), ATTACK, congestion_control=BLOCK)
+        wait_until(lambda: {(name, marker(name), ATTACK) for name in self._peers.names} <= self._peers.arrived)
+        for name, peer in self._peers.sessions.items():
+            for expression in concrete(self._peers.rights[name].says):
+                peer.put(expression, HONEST, congestion_control=BLOCK)
+            peer.put(marker("attacker"), HONEST, congestion_control=BLOCK)
+        for _ in self._peers.names:
+            assert self._marked.acquire(timeout=PATIENCE)
+
+
+def attack(peers: Peers, keys: Path, who: str) -> Reached:
+    with ExitStack() as stack:
+        return Attack(peers, keys, who, stack).all()
+
+
+def allowed(peers: Peers, who: str) -> Reached:
+    """What the contract lets through."""
+    own: Rights = peers.rights[who]
+    honest = {key for name in peers.names for key in concrete(peers.rights[name].says)}
+    tokens = {token for name in peers.names for token in concrete(peers.rights[name].shows)}
+    return Reached(
+        said={(name, key) for name in peers.names for key in concrete(own.says)},
+        shown={(name, token) for name in peers.names for token in concrete(own.shows)},
+        heard={key for key in honest if any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in own.hears)},
+        seen={key for key in tokens if any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in own.sees)},
+        answered=set(concrete(own.says)) if own.answers else set(),
+        asked={key(RUN, replay(name)) for name in peers.names} if own.asks else set(),
+    )
+
+
+def test_a_certificate_is_worth_what_the_contract_says(
+    pair: Gains, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With each certificate everything is tried; what its owner may do gets through to everybody, and nothing else."""
+    monkeypatch.setattr(ours, "access_control", with_markers)
+    with peers(pair.problem, keys) as there:
+        for who in everybody(pair.problem):
+            assert attack(there, keys, who) == allowed(there, who), who
+
+
+def test_without_access_control_everything_gets_through(
+    pair: Gains, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that the test above means something: one certificate is enough for every lie, and to hear everything."""
+    monkeypatch.setattr(ours, "access_control", lambda problem, *, run: {"enabled": False})
+    with peers(pair.problem, keys) as there:
+        reached, names = attack(there, keys, VIEWER), there.names
+        everything = {key for each in there.rights.values() for key in concrete(each.says)}
+        tokens = {token for each in there.rights.values() for token in concrete(each.shows)}
+        honest = [there.rights[name] for name in names]
+    kinds = [*everything, OTHER, *(f"delete {key}" for key in (*everything, OTHER))]
+    assert reached == Reached(
+        said={(name, key) for name in names for key in kinds},
+        shown={(name, token) for name in names for token in tokens},
+        heard={key for each in honest for key in concrete(each.says)},
+        seen={token for each in honest for token in concrete(each.shows)},
+        answered=everything,
+        asked={key(RUN, replay(name)) for name in names},
+    )
