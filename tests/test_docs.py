@@ -63,7 +63,7 @@ def test_names_of_the_code_exist(document: str) -> None:
 def unknown(command: str, rest: str) -> list[str]:
     """The command, or those of its options, that the program does not know."""
     with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()), pytest.raises(SystemExit) as caught:
-        main([command, "--help"])
+        main([command, *(rest.split()[:1] if command == "keys" else []), "--help"])
     known = re.findall(r"--[\w-]+", said.getvalue())
     return (
         [option for option in re.findall(r"--[\w-]+", rest) if option not in known]
@@ -79,7 +79,7 @@ def test_pictures_exist(document: str) -> None:
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-@pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md", "recordings/README.md"])
+@pytest.mark.parametrize("document", ["README.md", "CONTRIBUTING.md", "recordings/README.md", "security.md"])
 def test_commands_exist(document: str) -> None:
     """Every `peakmesh COMMAND --option` and every `.ci/script`."""
     found = re.findall(r"(?:`|^ *(?:\S*/)?)peakmesh (\w+)([^`\n#]*)", DOCUMENTS[document], flags=re.MULTILINE)
@@ -87,6 +87,7 @@ def test_commands_exist(document: str) -> None:
     assert [part for command, rest in found for part in unknown(command, rest)] == []
     assert unknown("design", "--force --without-nodes 1") == ["--without-nodes"]
     assert unknown("desing", "") == ["desing"]
+    assert unknown("keys", "renew FOLDER --problem P") == ["--problem"]
     assert [
         script for script in re.findall(r"\.ci/\w+", DOCUMENTS[document]) if not os.access(ROOT / script, os.X_OK)
     ] == []

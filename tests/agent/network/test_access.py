@@ -6,6 +6,7 @@ certificate of one of them tries everything, on every key.
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,13 +16,14 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from attackers import PATIENCE, configuration, wait_for_listeners
+from attackers import PATIENCE, SECONDS, configuration, let_in, wait_for_listeners
 
 from agent.authority import Authority
 from agent.contract.gains import Gains
 from agent.contract.keys import RECORDER, VIEWER, key, participants, replay
 from agent.contract.problem import Problem
 from agent.contract.rights import Rights, everybody, rights
+from agent.contract.sizes import largest
 from agent.network import configuration as ours
 from agent.network.access import access_control
 from agent.network.configuration import Network
@@ -270,3 +272,62 @@ def test_without_access_control_everything_gets_through(
         answered=everything,
         asked={key(RUN, replay(name)) for name in names},
     )
+
+
+def test_who_has_no_valid_certificate_gets_nothing(pair: Gains, keys: Path, tmp_path: Path) -> None:
+    """None, one of another authority, an expired one; nor without TLS. Nor does the one to whom others connect."""
+    problem = pair.problem
+    other, mixed, expired = tmp_path / "other", tmp_path / "mixed", tmp_path / "expired"
+    other.mkdir()
+    Authority.create(other, problem.name, days=1).issue(["node-n0"], days=1)
+    for folder in (mixed, expired):
+        shutil.copytree(keys, folder)
+    for kind in ("pem", "key"):
+        shutil.copy(other / f"node-n0.{kind}", mixed)
+    Authority.load(expired).issue(["node-n0"], days=-0.5)  # type: ignore[arg-type]
+    with peers(problem, keys) as there:
+        address, plain = there.address, there.address.replace("tls/", "tcp/")
+        assert let_in(
+            {
+                "with a certificate": configuration(address, keys, "node-n0"),
+                "no certificate": configuration(address, keys, seconds=SECONDS),
+                "another authority": configuration(address, other, "node-n0", seconds=SECONDS),
+                "another authority's certificate": configuration(address, mixed, "node-n0", seconds=SECONDS),
+                "expired": configuration(address, expired, "node-n0", seconds=SECONDS),
+                "no TLS": configuration(plain, None, seconds=SECONDS),
+            }
+        ) == {"with a certificate"}
+        why = {folder.name: Credentials(folder, "node-n0").why_not(address) for folder in (other, mixed, expired)}
+    assert why["other"].startswith(f"who listens at {address} has no certificate that {other}/ca.pem vouches for: ")
+    assert why["mixed"].startswith(f"who listens at {address} does not accept {mixed}/node-n0.pem: ")
+    assert (
+        why["expired"]
+        == f"who listens at {address} does not accept {expired}/node-n0.pem: sslv3_alert_certificate_expired"
+    )
+
+
+def test_what_is_larger_than_any_message_does_not_come_in(pair: Gains) -> None:
+    """With and without keys: in one piece or in many, published or as an answer; what is as large as can be does."""
+    limit = largest(pair.problem)
+    arrived = list[int]()
+    done = threading.Event()
+
+    def take(sample: zenoh.Sample) -> None:
+        size = len(sample.payload.to_bytes())
+        if size:
+            arrived.append(size)
+        else:
+            done.set()
+
+    network = Network("tcp/127.0.0.1:0", problem=pair.problem)
+    with closing(Session(network, run=RUN, who=RECORDER, hand_over=lambda duty: None)) as session:
+        session._declared.append(session._zenoh.declare_subscriber("peakmesh/**", take))
+        with zenoh.open(configuration(session.locators()[0], None)) as attacker:
+            wait_for_listeners(attacker, ["peakmesh/any"])
+            attacker.declare_queryable("question", lambda query: query.reply("question", bytes(limit + 1)))
+            for size in (limit, limit + 1, 2 * limit, 50 * limit, limit - 1, 0):
+                attacker.put("peakmesh/any", bytes(size), congestion_control=BLOCK)
+            assert done.wait(PATIENCE)
+            replies = [reply.ok for reply in session._zenoh.get("question", timeout=PATIENCE)]
+    assert arrived == [limit, limit - 1]
+    assert replies == []
