@@ -146,9 +146,8 @@ class Credentials:
                 f"who listens at {address} has no certificate that {self.authority} vouches for: {error.verify_message}"
             )
         except ssl.SSLError as error:
-            return (
-                f"who listens at {address} does not accept {self.certificate}: {(error.reason or str(error)).lower()}"
-            )
+            alert = (error.reason or "").lower().partition("alert_")[2].replace("_", " ")
+            return f"who listens at {address} does not accept {self.certificate}: {alert or error}"
         except OSError:
             return ""
         return ""
