@@ -1,12 +1,15 @@
 """The authority of a network's keys: makes certificates, renews them, says what is there. Alone imports cryptography.
 
 A folder has the authority's certificate `ca.pem` and private key `ca.key`, and for everybody a certificate `<who>.pem`
-and a private key `<who>.key`. The authority's private key makes certificates; nobody needs it to take part.
+and a private key `<who>.key`; for a sensor both again in `<who>.json5`, as a configuration of Zenoh. The authority's
+private key makes certificates; nobody needs it to take part.
 """
 
 from __future__ import annotations
 
+import json
 import os
+from base64 import b64encode
 from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,8 +22,10 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from agent.contract.errors import InputError
 from agent.contract.files import read_bytes
+from agent.contract.keys import sensor_who
 from agent.network.credentials import AUTHORITY, AUTHORITY_NAME
 
+PEM = serialization.Encoding.PEM
 AUTHORITY_KEY = "ca.key"
 LONGEST_NAME = 64  # characters, of a common name in X.509
 EARLIER = timedelta(days=1)  # certificates begin so long ago: clocks differ
@@ -85,7 +90,21 @@ class Authority:
                 .add_extension(whose, critical=False)
                 .sign(self._private, hashes.SHA256())
             )
-            _write(self._folder, who, certificate, private)
+            pair = _write(self._folder, who, certificate, private)
+            if who.startswith(sensor_who("")):
+                _write_whole(self._folder / f"{who}.json5", _zenoh(self._certificate, *pair), 0o600)
+
+
+def _zenoh(authority: x509.Certificate, certificate: bytes, private: bytes) -> bytes:
+    """A file for zenoh.Config.from_file, for programs that are not of peakmesh: all that they need."""
+    tls = {
+        "root_ca_certificate_base64": b64encode(authority.public_bytes(PEM)).decode(),
+        "connect_certificate_base64": b64encode(certificate).decode(),
+        "connect_private_key_base64": b64encode(private).decode(),
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+    }
+    return json.dumps({"transport": {"link": {"tls": tls}}}, indent=1).encode()
 
 
 def certificates(folder: Path) -> list[Certificate]:
@@ -157,14 +176,20 @@ def _builder(
     )
 
 
-def _write(folder: Path, who: str, certificate: x509.Certificate, private: ec.EllipticCurvePrivateKey) -> None:
-    """Both files whole, the private key for nobody else to read."""
-    pem = private.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    shown = certificate.public_bytes(serialization.Encoding.PEM)
-    for name, data, mode in ((f"{who}.key", pem, 0o600), (f"{who}.pem", shown, 0o644)):
-        part = folder / f".{name}.{os.getpid()}.part"
-        with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(data)
-        part.replace(folder / name)
+def _write(
+    folder: Path, who: str, certificate: x509.Certificate, private: ec.EllipticCurvePrivateKey
+) -> tuple[bytes, bytes]:
+    """Write certificate and private key as PEM, and return them."""
+    shown = certificate.public_bytes(PEM)
+    secret = private.private_bytes(PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    _write_whole(folder / f"{who}.key", secret, 0o600)
+    _write_whole(folder / f"{who}.pem", shown, 0o644)
+    return shown, secret
+
+
+def _write_whole(path: Path, data: bytes, mode: int) -> None:
+    """With this mode from the beginning, in the place of what is there."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(data)
+    part.replace(path)

@@ -1,4 +1,4 @@
-"""A sensor of your own for one node: python sensor.py RUN NODE ADDRESS-OF-COORDINATOR."""
+"""A sensor of your own for one node: python sensor.py RUN NODE ADDRESS-OF-COORDINATOR [KEYS]."""
 
 import json
 import queue
@@ -6,8 +6,10 @@ import sys
 
 import zenoh
 
-base, node, config = f"peakmesh/{sys.argv[1]}", sys.argv[2], zenoh.Config()
+base, node = f"peakmesh/{sys.argv[1]}", sys.argv[2]
+config = zenoh.Config.from_file(sys.argv[4]) if sys.argv[4:] else zenoh.Config()
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[3]]))
+config.insert_json5("listen/endpoints", "[]")  # nobody needs to connect to it
 config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
     modes, tokens, waiting = queue.SimpleQueue(), queue.SimpleQueue(), {f"node-{node}", "recorder", "coordinator"}

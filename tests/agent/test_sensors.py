@@ -12,24 +12,27 @@ from made_recordings import observer_gains, real_problem
 from places import ROOT
 from runs import PATIENCE, logged, run_here
 
+from agent.authority import Authority
 from agent.contract.gains import Gains
+from agent.contract.rights import everybody
 from designer.replay import replay
 
 SENSOR = ROOT / "docs" / "sensor.py"
 
 
 def measured_by(
-    script: Path, gains_path: Path, recording: Path, *, node: str, steps: int
+    script: Path, gains_path: Path, recording: Path, *, node: str, steps: int, keys: Path | None = None
 ) -> list[tuple[int, list[float]]]:
     """Run with a sensor script for one node; step and y of its measurements. Nothing is missing, the replay agrees."""
     sensor: list[subprocess.Popen[bytes]] = []
 
     def start_sensor(word: dict[str, Any]) -> None:
         if "listening" in word:
-            sensor.append(subprocess.Popen([sys.executable, script, "test", node, word["listening"][0]]))
+            words = ["test", node, word["listening"][0], *([keys / f"sensor-{node}.json5"] if keys is not None else [])]
+            sensor.append(subprocess.Popen([sys.executable, script, *words]))
 
     try:
-        summary = run_here(gains_path, recording, heed=start_sensor, steps=steps, external=(node,))
+        summary = run_here(gains_path, recording, heed=start_sensor, steps=steps, external=(node,), keys=keys)
         assert sensor[0].wait(PATIENCE) == 0  # it ends with the run
     finally:
         for process in sensor:
@@ -42,12 +45,15 @@ def measured_by(
 
 
 def test_sensor_of_ones_own(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
-    """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows."""
+    """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows. All with keys."""
     lines = [line for line in SENSOR.read_text().splitlines() if line.strip()]
-    assert len(lines) < 20
+    assert len(lines) <= 21
     assert not any("peakmesh import" in line or "import agent" in line for line in lines)
     name = pair.problem.node_names[0]
-    measured = measured_by(SENSOR, pair_path, tmp_path / "run.mcap", node=name, steps=60)
+    keys = tmp_path / "keys"
+    keys.mkdir()
+    Authority.create(keys, pair.problem.name, days=1).issue(everybody(pair.problem), days=1)
+    measured = measured_by(SENSOR, pair_path, tmp_path / "run.mcap", node=name, steps=60, keys=keys)
     assert measured == [(k, [0.0]) for k in range(60)]
 
 

@@ -63,3 +63,11 @@ def wait_for_listeners(session: zenoh.Session, keys: Iterable[str]) -> None:
             assert time.monotonic() < deadline, f"nobody listens to {key}"
             time.sleep(0.01)
         publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+def wait_for_peers(session: zenoh.Session, count: int) -> None:
+    """Until it has links to so many."""
+    deadline = time.monotonic() + PATIENCE
+    while len(session.info.peers_zid()) < count:
+        assert time.monotonic() < deadline, session.info.peers_zid()
+        time.sleep(0.01)

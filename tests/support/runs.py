@@ -156,6 +156,7 @@ def run_here(
     at: int = 0,
     do: Callable[[], None] = lambda: None,
     heed: Callable[[dict[str, Any]], None] = lambda word: None,
+    keys: Path | None = None,
     **plan: Any,
 ) -> dict[str, Any]:
     """Launch a run from this process, call `do` once `at` steps are complete; `heed` gets every word."""
@@ -177,6 +178,7 @@ def run_here(
         force=False,
         wait=PATIENCE,
         report=report,
+        keys=keys,
     )
 
 

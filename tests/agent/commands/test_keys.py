@@ -40,10 +40,10 @@ def keys(made: Path, tmp_path: Path) -> Path:
 
 def test_everybody_gets_a_certificate_and_a_private_key(made: Path) -> None:
     """And the sensors that were asked for; each pair is good for its owner, and private keys are private."""
-    assert {path.name for path in made.iterdir()} == {
-        f"{who}.{kind}" for who in ["ca", *WHOS] for kind in ("pem", "key")
-    }
-    assert {stat.S_IMODE(path.stat().st_mode) for path in made.glob("*.key")} == {0o600}
+    files = {f"{who}.{kind}" for who in ["ca", *WHOS] for kind in ("pem", "key")} | {"sensor-left.json5"}
+    assert {path.name for path in made.iterdir()} == files
+    private = {path.name for path in made.iterdir() if stat.S_IMODE(path.stat().st_mode) == 0o600}
+    assert private == {name for name in files if not name.endswith(".pem")}
     assert stat.S_IMODE(made.stat().st_mode) == 0o700
     for who in WHOS:
         Credentials(made, who).check(PROBLEM)
@@ -78,7 +78,8 @@ def test_renewed_keys_are_new_and_good(keys: Path) -> None:
 
     done = here("keys", "renew", keys, "node-left", "sensor-right", "--days", 10, "--json")
     assert [found["who"] for found in json.loads(done.stdout)["certificates"]] == ["node-left", "sensor-right"]
-    assert changed() == {f"{who}.{kind}" for who in ("node-left", "sensor-right") for kind in ("pem", "key")}
+    renewed = {f"{who}.{kind}" for who in ("node-left", "sensor-right") for kind in ("pem", "key")}
+    assert changed() == renewed | {"sensor-right.json5"}
     assert here("keys", "renew", keys).returncode == 0
     assert changed() == {path.name for path in keys.iterdir()} - {"ca.pem", "ca.key"}
     for who in [*WHOS, "sensor-right"]:
