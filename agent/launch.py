@@ -11,6 +11,7 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -57,13 +58,13 @@ def launch(
         commands[PLANT] = ["plant", *common]
     options = _recorder_options(recording_plan or RecordingPlan(), force=force)
     commands[RECORDER] = ["recorder", *common, "--output", str(recording), *options]
-    with _Crew(survives=plan.pace is not None) as crew:
+    with _Crew(survives=plan.pace is not None, by_sockets=keys is None) as crew:
         for who, command in commands.items():
             crew.start(who, command)
         summary: dict[str, Any] = {}
         for word in crew.words_of_coordinator():
             if "listening" in word:
-                crew.keep_address(word["listening"][0])
+                crew.tell_address(word["listening"][0])
             elif "started" in word:
                 crew.started = True
                 summary.setdefault("start_seconds", word["started"] - began)
@@ -109,8 +110,9 @@ def _recorder_options(plan: RecordingPlan, *, force: bool) -> list[str]:
 class _Crew:
     """The processes of one run. Where it `survives`, who ends early is started again."""
 
-    def __init__(self, *, survives: bool) -> None:
-        self.started, self.survives = False, survives
+    def __init__(self, *, survives: bool, by_sockets: bool) -> None:
+        """Roles meet at Unix sockets that they know, or are told where the coordinator listens."""
+        self.started, self.survives, self._by_sockets = False, survives, by_sockets
         self._commands: dict[str, list[str]] = {}
         self._address = ""  # of the coordinator
         self._revived: dict[str, list[float]] = {}  # when
@@ -122,7 +124,7 @@ class _Crew:
 
     def start(self, who: str, command: list[str]) -> None:
         self._commands[who] = command
-        arguments = [*command, "--sockets", str(self._nursery.folder)]
+        arguments = [*command, *(["--sockets", str(self._nursery.folder)] if self._by_sockets else [])]
         self._children[who] = self._nursery.start(arguments, wants_output=who == COORDINATOR)
         if self._signal is not None:  # it came before there was anybody to pass it on to
             self._end_run(self._signal)
@@ -150,11 +152,18 @@ class _Crew:
             *lines, rest = (rest + said).split(b"\n")
             yield from lines
 
-    def keep_address(self, address: str) -> None:
-        """Where a coordinator that comes back is to listen: at the address at which others know it."""
+    def tell_address(self, address: str) -> None:
+        """Where the coordinator listens, and is to listen when it comes back; everybody is told who is not told yet."""
         if not self._address:
             self._address = address
             self._commands[COORDINATOR] += ["--listen", address]
+            for who in self._children:
+                self._tell(who)
+
+    def _tell(self, who: str) -> None:
+        if who != COORDINATOR and not self._by_sockets:
+            with suppress(BrokenPipeError):  # it has ended already
+                self._children[who].stdin.write(f"{self._address}\n".encode())
 
     def _revive(self, who: str) -> bool:
         """Start somebody again who has ended; False where that is not to be, or has been tried too often."""
@@ -166,6 +175,7 @@ class _Crew:
         self._revived[who] = times
         self._children[who].close()
         self.start(who, self._commands[who])
+        self._tell(who)
         return True
 
     def wait(self) -> None:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agent.commands.options import Subcommands, add_command
+from agent.commands.options import Subcommands, add_command, load_gains
 from agent.commands.roles import add_network_options, network_of
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ def add_looker(
 
 def look_on(options: argparse.Namespace) -> AbstractContextManager[Onlooker]:
     """The run that the options name, or the only one that is there."""
+    from agent.contract.keys import VIEWER
     from agent.roles.onlooker import looking_on
 
-    return looking_on(network_of(options), run=options.run)
+    problem = load_gains(options.gains).problem if options.gains is not None else None
+    return looking_on(network_of(options, VIEWER, problem), run=options.run)

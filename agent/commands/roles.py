@@ -36,6 +36,7 @@ LEAST_LEASE = 10.0  # s; where a run may stand still for longer, links last twic
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
+    from agent.contract.problem import Problem
     from agent.network.configuration import Network
 
 
@@ -164,7 +165,7 @@ def live_command(options: argparse.Namespace) -> int:
             "--insecure lets them"
         )
     viewer.run(
-        network_of(options, VIEWER, gains),
+        network_of(options, VIEWER, gains.problem),
         gains,
         run=options.run or gains.problem.name,
         host=options.host,
@@ -214,20 +215,20 @@ def _publisher(options: argparse.Namespace, gains: Gains, who: str, role: Callab
 def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
     """Where a participant is; in a run on one machine only the coordinator can be reached by an address, too."""
     from agent.contract.keys import COORDINATOR
+    from agent.contract.sizes import largest
     from agent.network.links import sockets
 
-    network = network_of(options, who, gains)
+    network = replace(network_of(options, who, gains.problem), largest=largest(gains.problem))
     if options.sockets is None:
         return network
     listen = network.listen if who == COORDINATOR else ""
     return replace(network, listen=listen, sockets=sockets(gains.problem, who, options.sockets))
 
 
-def network_of(options: argparse.Namespace, who: str, gains: Gains | None) -> Network:
-    """What the options of `add_network_options` ask for, of `who`; without `gains` it believes every certificate."""
+def network_of(options: argparse.Namespace, who: str, problem: Problem | None) -> Network:
+    """What the options of `add_network_options` ask for, of `who`; without `problem` it believes every certificate."""
     from agent.network.configuration import Network
 
-    problem = gains.problem if gains is not None else None
     credentials = credentials_of(options, who, problem)
     listen = options.listen or default_listen(options)
     connect = tuple(options.connect)
@@ -244,7 +245,7 @@ def network_of(options: argparse.Namespace, who: str, gains: Gains | None) -> Ne
             if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
                 raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
             refuse_insecure(option, address, keys=options.keys, insecure=options.insecure)
-    return Network(listen, connect, options.wait, problem=problem, credentials=credentials)
+    return Network(listen, connect, options.wait, credentials=credentials, problem=problem)
 
 
 def _stop_with_launcher() -> None:

@@ -13,6 +13,7 @@ from agent.contract.keys import (
     CONTROL,
     COORDINATOR,
     EVENT,
+    FACTS,
     MODE,
     PLANT,
     RECORDER,
@@ -61,7 +62,8 @@ def _rights(who: str, problem: Problem, run: str) -> Rights:
         return [key(run, topic, who=who) for topic in topics]
 
     if who == VIEWER:
-        return Rights([], [key(run, watch("**"))], [], keys(alive("*")), [], [])
+        found = key("*", alive(COORDINATOR))  # whatever the run is called that it looks for
+        return Rights([], [key(run, watch("**"))], [], [*keys(alive("*")), found], [], keys(FACTS))
     data = _data(who, problem)
     if who.startswith(sensor_who("")):
         return Rights(keys(*data), keys(MODE), keys(alive(who)), keys(alive("*")), [], [])
@@ -72,7 +74,7 @@ def _rights(who: str, problem: Problem, run: str) -> Rights:
         hears=[key(run, topic) for topic in (*_heard(who, problem), own[0])],
         shows=keys(alive(who), own[1]),
         sees=keys(alive("*"), own[1]),
-        answers=keys(replay(who)),
+        answers=keys(replay(who), *([FACTS] if who == RECORDER else [])),
         asks=keys(*map(replay, participants(problem))) if who == RECORDER else [],
     )
 

@@ -43,7 +43,7 @@ def _rules(own: Rights, *, everything: str) -> Iterator[tuple[str, list[str], li
     yield "ingress", ["liveliness_token"], own.shows
     yield "ingress", ["liveliness_query", "declare_liveliness_subscriber"], own.sees
     yield "ingress", ["declare_queryable"], own.answers
-    yield "ingress", ["reply"], own.says if own.answers else []
+    yield "ingress", ["reply"], [*own.says, *own.answers] if own.answers else []
     yield "ingress", ["query"], own.asks
     yield "egress", ["put"], own.hears
     yield "egress", ["liveliness_token"], own.sees

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from agent.contract.problem import Problem
-from agent.contract.sizes import largest
 from agent.network.access import access_control
 from agent.network.credentials import Credentials
 from agent.network.links import Sockets
@@ -33,13 +33,9 @@ class Network:
     lease: float = 20.0  # seconds
     routes: bool = False  # takes no part, but passes on what others say
     sockets: Sockets | None = None
-    problem: Problem | None = None  # of the run; where it is known, nothing comes in that is larger than it can have
-    credentials: Credentials | None = None  # with them everybody must show some; what they allow is in the problem
-
-    @property
-    def largest(self) -> int | None:
-        """Bytes that a message can have; None where that is not known."""
-        return largest(self.problem) if self.problem is not None else None
+    largest: float = math.inf  # bytes: nothing comes in that is larger
+    credentials: Credentials | None = None  # with them, everybody must show some
+    problem: Problem | None = None  # says what whose credentials allow; without it, whoever has some is believed
 
     def refusal(self) -> str:
         """Why nobody to whom it connects is reached, where certificates are the reason; otherwise ""."""
@@ -82,8 +78,8 @@ def zenoh_configuration(network: Network, *, run: str) -> dict[str, Any]:
     }
     if network.sockets is not None:
         _keep_to(network.sockets, configuration, listen=[network.listen] if network.listen else [])
-    if network.largest is not None:
-        _let_in_no_larger(network.largest, configuration)
+    if network.largest < math.inf:
+        _let_in_no_larger(int(network.largest), configuration)
     if network.credentials is not None:
         configuration["transport"]["link"] |= {"protocols": ["tls"], "tls": _tls(network.credentials)}
         if network.problem is not None and run:

@@ -7,7 +7,6 @@ is handed over as a duty, for the main thread to do.
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -65,7 +64,7 @@ class Session:
         self._shown: dict[str, zenoh.Publisher] = {}  # the same for viewers
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
-        self._largest = network.largest or math.inf
+        self._largest = network.largest
         self._zenoh = _open(network, run)
         self._zid = str(self._zenoh.zid())
         self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first

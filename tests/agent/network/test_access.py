@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from attackers import PATIENCE, SECONDS, configuration, let_in, wait_for_listene
 
 from agent.authority import Authority
 from agent.contract.gains import Gains
-from agent.contract.keys import RECORDER, VIEWER, key, participants, replay
+from agent.contract.keys import RECORDER, VIEWER, participants
 from agent.contract.problem import Problem
 from agent.contract.rights import Rights, everybody, rights
 from agent.contract.sizes import largest
@@ -43,17 +44,19 @@ def keys(pair: Gains, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def marker(who: str) -> str:
-    """The only key that tests add: where it has come to `who`, all that was sent before it has come or was dropped."""
-    return f"marker/{who}"
+MARKER = (
+    "peakmesh/marker"  # the only key that tests add: where it has come, what was sent before has come, or never will
+)
+TO_ATTACKER = "peakmesh/marker/attacker"
 
 
 def with_markers(problem: Problem, *, run: str) -> dict[str, Any]:
     """The access control of the program, which lets markers through too, and does not hide what the test listens to."""
     control = access_control(problem, run=run)
     for flow, messages, keys in (
-        ("ingress", ["put", "declare_subscriber"], marker("*")),
-        ("egress", ["put"], marker("*")),
+        ("ingress", ["put"], MARKER),
+        ("ingress", ["declare_subscriber"], TO_ATTACKER),
+        ("egress", ["put"], TO_ATTACKER),
         ("egress", ["declare_subscriber", "declare_liveliness_subscriber"], "**"),
     ):
         name = f"test {flow} {messages[0]}"
@@ -109,9 +112,9 @@ class Peers:
 
         opened, live = self.sessions[who], self.sessions[who].liveliness()
         session._declared += [
-            opened.declare_queryable(key(RUN, replay(who)), answer),
+            *(opened.declare_queryable(question, answer) for question in self.rights[who].answers),
             live.declare_subscriber("**", see),
-            *(opened.declare_subscriber(expression, take) for expression in ("peakmesh/**", marker(who))),
+            opened.declare_subscriber("peakmesh/**", take),
         ]
 
 
@@ -142,18 +145,19 @@ class Attack:
         self._shows = sorted({key for each in everybody_has for key in concrete(each.shows)})
         self._sees = sorted({key for each in everybody_has for key in each.sees})
         self._answers = sorted({key for each in everybody_has for key in each.answers})
-        self._marked = threading.Semaphore(0)
+        self._marked, self._markers = threading.Semaphore(0), count()
         self._session = stack.enter_context(zenoh.open(configuration(peers.address, keys, who)))
-        wait_for_listeners(self._session, map(marker, peers.names))
-        self._session.declare_subscriber(marker("attacker"), lambda sample: self._marked.release())
+        self._session.declare_subscriber(TO_ATTACKER, lambda sample: self._marked.release())
+        peers.arrived.clear()
+        wait_until(self._everybody_listens)
 
-    def all(self) -> Reached:
-        said, shown = self.speak()
+    def all(self, tokens: set[tuple[str, str]]) -> Reached:
+        said, shown = self.speak(tokens)
         heard, seen, asked = self.spy()
         return Reached(said, shown, heard, seen, self.answer(), asked)
 
-    def speak(self) -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
-        """Publish, delete and show tokens on every key: what reaches whom."""
+    def speak(self, expected: set[tuple[str, str]]) -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
+        """Publish, delete and show tokens on every key: what reaches whom. `expected` tokens are waited for."""
         self._peers.arrived.clear()
         self._peers.seen.clear()
         tokens = [self._session.liveliness().declare_token(token) for token in self._shows]
@@ -161,8 +165,9 @@ class Attack:
             self._session.put(expression, ATTACK, congestion_control=BLOCK)
             self._session.delete(expression)
         self._there_and_back()
-        said = {(name, key) for name, key, _ in self._peers.arrived if not key.startswith(marker(""))}
-        shown = set(self._peers.seen)
+        wait_until(lambda: expected <= self._peers.seen)
+        said = {(name, key) for name, key, _ in self._peers.arrived.copy() if key != MARKER}
+        shown = self._peers.seen.copy()
         for token in tokens:
             token.undeclare()  # type: ignore[no-untyped-call]
         return said, shown
@@ -172,7 +177,7 @@ class Attack:
         heard, seen, asked = set[str](), set[str](), set[str]()
 
         def hear(sample: zenoh.Sample) -> None:
-            if sample.payload.to_string() == HONEST and str(sample.key_expr) != marker("attacker"):
+            if sample.payload.to_string() == HONEST and str(sample.key_expr) != TO_ATTACKER:
                 heard.add(str(sample.key_expr))
 
         with ExitStack() as honest:
@@ -195,7 +200,7 @@ class Attack:
 
         def lie(query: zenoh.Query) -> None:
             with query:
-                for expression in self._says:
+                for expression in (*self._says, *self._answers):
                     query.reply(expression, ATTACK)
 
         for question in self._answers:
@@ -212,20 +217,32 @@ class Attack:
 
     def _there_and_back(self) -> None:
         """Until everything sent so far has come to everybody, and what everybody says has come back."""
-        for name in self._peers.names:
-            self._session.put(marker(name), ATTACK, congestion_control=BLOCK)
-        wait_until(lambda: {(name, marker(name), ATTACK) for name in self._peers.names} <= self._peers.arrived)
+        marker = self._mark()
+        wait_until(lambda: self._has_come(marker))
         for name, peer in self._peers.sessions.items():
             for expression in concrete(self._peers.rights[name].says):
                 peer.put(expression, HONEST, congestion_control=BLOCK)
-            peer.put(marker("attacker"), HONEST, congestion_control=BLOCK)
+            peer.put(TO_ATTACKER, HONEST, congestion_control=BLOCK)
         for _ in self._peers.names:
             assert self._marked.acquire(timeout=PATIENCE)
 
+    def _mark(self) -> str:
+        marker = f"{ATTACK} {next(self._markers)}"
+        self._session.put(MARKER, marker, congestion_control=BLOCK)
+        return marker
 
-def attack(peers: Peers, keys: Path, who: str) -> Reached:
+    def _everybody_listens(self) -> bool:
+        """And has told us: some marker has come to each."""
+        self._mark()
+        return {name for name, key, _ in self._peers.arrived.copy() if key == MARKER} == set(self._peers.names)
+
+    def _has_come(self, marker: str) -> bool:
+        return {(name, MARKER, marker) for name in self._peers.names} <= self._peers.arrived
+
+
+def attack(peers: Peers, keys: Path, who: str, *, tokens: set[tuple[str, str]]) -> Reached:
     with ExitStack() as stack:
-        return Attack(peers, keys, who, stack).all()
+        return Attack(peers, keys, who, stack).all(tokens)
 
 
 def allowed(peers: Peers, who: str) -> Reached:
@@ -238,8 +255,8 @@ def allowed(peers: Peers, who: str) -> Reached:
         shown={(name, token) for name in peers.names for token in concrete(own.shows)},
         heard={key for key in honest if any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in own.hears)},
         seen={key for key in tokens if any(zenoh.KeyExpr(each).includes(zenoh.KeyExpr(key)) for each in own.sees)},
-        answered=set(concrete(own.says)) if own.answers else set(),
-        asked={key(RUN, replay(name)) for name in peers.names} if own.asks else set(),
+        answered={*concrete(own.says), *own.answers} if own.answers else set(),
+        asked=set(own.asks),
     )
 
 
@@ -250,7 +267,10 @@ def test_a_certificate_is_worth_what_the_contract_says(
     monkeypatch.setattr(ours, "access_control", with_markers)
     with peers(pair.problem, keys) as there:
         for who in everybody(pair.problem):
-            assert attack(there, keys, who) == allowed(there, who), who
+            may = allowed(there, who)
+            reached = attack(there, keys, who, tokens=may.shown)
+            for kind, got, wanted in zip(Reached._fields, reached, may, strict=True):
+                assert (got - wanted, wanted - got) == (set(), set()), f"{who}: {kind}: too much, too little"
 
 
 def test_without_access_control_everything_gets_through(
@@ -259,18 +279,20 @@ def test_without_access_control_everything_gets_through(
     """So that the test above means something: one certificate is enough for every lie, and to hear everything."""
     monkeypatch.setattr(ours, "access_control", lambda problem, *, run: {"enabled": False})
     with peers(pair.problem, keys) as there:
-        reached, names = attack(there, keys, VIEWER), there.names
+        names = there.names
         everything = {key for each in there.rights.values() for key in concrete(each.says)}
         tokens = {token for each in there.rights.values() for token in concrete(each.shows)}
         honest = [there.rights[name] for name in names]
+        shown = {(name, token) for name in names for token in tokens}
+        reached = attack(there, keys, VIEWER, tokens=shown)
     kinds = [*everything, OTHER, *(f"delete {key}" for key in (*everything, OTHER))]
     assert reached == Reached(
         said={(name, key) for name in names for key in kinds},
-        shown={(name, token) for name in names for token in tokens},
+        shown=shown,
         heard={key for each in honest for key in concrete(each.says)},
         seen={token for each in honest for token in concrete(each.shows)},
-        answered=everything,
-        asked={key(RUN, replay(name)) for name in names},
+        answered=everything | {key for each in there.rights.values() for key in each.answers},
+        asked={key for each in honest for key in each.answers},
     )
 
 
@@ -316,7 +338,7 @@ def test_what_is_larger_than_any_message_does_not_come_in(pair: Gains) -> None:
         else:
             done.set()
 
-    network = Network("tcp/127.0.0.1:0", problem=pair.problem)
+    network = Network("tcp/127.0.0.1:0", largest=limit)
     with closing(Session(network, run=RUN, who=RECORDER, hand_over=lambda duty: None)) as session:
         session._declared.append(session._zenoh.declare_subscriber("peakmesh/**", take))
         with zenoh.open(configuration(session.locators()[0], None)) as attacker:
