@@ -21,9 +21,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="peakmesh", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     run.add_run(commands)
-    roles.add_roles(commands)
+    roles.add_roles(commands, {} if "--child" in words else os.environ)  # a launcher says all to its children
     keys.add_keys(commands)
-    return perform(parser.parse_args(arguments))
+    return perform(parser.parse_args(words))
+
+
+def open_streams() -> None:
+    """Where a standard stream was closed, open it to nowhere: else the next file opened would be taken for it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115 -- for good
 
 
 def perform(options: argparse.Namespace) -> int:

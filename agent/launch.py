@@ -50,7 +50,7 @@ def launch(
     on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
     began = time.time()
-    common = [str(gains_path), "--run", run, "--wait", str(wait), "--child"]
+    common = [str(gains_path), "--run", run, "--wait", str(wait), "--deadline", str(plan.deadline), "--child"]
     common += ["--keys", str(keys)] if keys is not None else []
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
     commands |= {node_who(name): ["node", "--node", name, *common] for name in gains.problem.node_names}

@@ -28,7 +28,15 @@ from agent.commands.options import (
     recording_plan_of,
     run_name,
 )
-from agent.commands.security import add_security_options, credentials_of, default_listen, is_loopback, refuse_insecure
+from agent.commands.security import (
+    add_insecure_option,
+    add_keys_option,
+    credentials_of,
+    default_listen,
+    refuse_insecure,
+)
+from agent.commands.supervisor import tell_supervisor
+from agent.commands.variables import Repeated, heed_variables
 from agent.commands.words import say_broken_off, say_to_launcher, say_to_person
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, InputError, RunBroken
 
@@ -59,6 +67,7 @@ def add_roles(commands: Subcommands, environment: Mapping[str, str] = os.environ
     router.add_argument(
         "--listen", default="tcp/127.0.0.1:7447", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:7447)"
     )
+    add_insecure_option(router)
     for role in (node, plant, coordinator, recorder, live, router):
         heed_variables(role, environment)
 
@@ -84,7 +93,8 @@ def add_network_options(
     parser.add_argument(
         "--listen",
         metavar="ADDRESS",
-        help="where to be reached (tcp/127.0.0.1:0, with --keys tls/127.0.0.1:0; port 0 takes a free one)",
+        help="where to be reached (tcp/127.0.0.1:0, with --keys tls/127.0.0.1:0; port 0 takes a free one), or none: by "
+        "nobody, everything goes through the one that --connect names",
     )
     parser.add_argument(
         "--connect",
@@ -95,7 +105,8 @@ def add_network_options(
         "multicast, for everybody, where it is to be found on the local network",
     )
     parser.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for the others (60)")
-    add_security_options(parser)
+    add_keys_option(parser)
+    add_insecure_option(parser)
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--sockets", type=Path, help=argparse.SUPPRESS)  # of a run on one machine, a folder
 
@@ -130,7 +141,8 @@ def coordinator_command(options: argparse.Namespace) -> int:
     say = say_to_launcher if options.child else say_to_person
     run = options.run or gains.problem.name
     with Bus(_place(options, gains, COORDINATOR), run=run, who=COORDINATOR) as bus:
-        say({"listening": bus.locators()})
+        say({"listening": bus.locators() or list(options.connect)})
+        _tell_supervisor(options, "the coordinator waits for everybody")
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
     return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
@@ -156,10 +168,11 @@ def recorder_command(options: argparse.Namespace) -> int:
 def live_command(options: argparse.Namespace) -> int:
     """`peakmesh live GAINS`: looks on, and takes no part."""
     from agent.contract.keys import VIEWER
+    from agent.network.addresses import reaches_other_machines
     from agent.roles import viewer
 
     gains = load_gains(options.gains)
-    if not (options.insecure or is_loopback(options.host)):
+    if reaches_other_machines(f"tcp/{options.host}:0") and not options.insecure:
         raise InputError(
             f"--host {options.host}: others could look on, for Foxglove is sent everything in the clear; "
             "--insecure lets them"
@@ -184,6 +197,7 @@ def router_command(options: argparse.Namespace) -> int:
     refuse_addresses(listen=options.listen, connect=())
     if options.listen == NONE:
         raise InputError("--listen none: nobody could reach the router")
+    refuse_insecure(options.listen, (), keys=None, insecure=options.insecure)
 
     def say(addresses: list[str]) -> None:
         print(f"listening at {', '.join(addresses)}", file=sys.stderr, flush=True)
@@ -227,6 +241,7 @@ def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
 
 def network_of(options: argparse.Namespace, who: str, problem: Problem | None) -> Network:
     """What the options of `add_network_options` ask for, of `who`; without `problem` it believes every certificate."""
+    from agent.network.addresses import NONE, refuse_addresses
     from agent.network.configuration import Network
 
     credentials = credentials_of(options, who, problem)
@@ -240,12 +255,11 @@ def network_of(options: argparse.Namespace, who: str, problem: Problem | None) -
         threading.Thread(target=_stop_with_launcher, daemon=True).start()
     elif not connect and (options.command != "coordinator" or options.listen == NONE):
         raise InputError("--connect is missing: it takes the coordinator's address, such as tcp/127.0.0.1:7447")
-    for option, addresses in (("--listen", (listen,)), ("--connect", connect)):
-        for address in addresses:
-            if not re.fullmatch(r"[a-z0-9-]+/\S+", address):
-                raise InputError(f"{option} {address}: an address looks like tcp/127.0.0.1:7447")
-            refuse_insecure(option, address, keys=options.keys, insecure=options.insecure)
-    return Network(listen, connect, options.wait, credentials=credentials, problem=problem)
+    refuse_addresses(listen=listen, connect=connect)
+    refuse_insecure(listen, connect, keys=options.keys, insecure=options.insecure)
+    deadline = options.deadline if "deadline" in options else 0.0  # a viewer's own patience is nobody's concern
+    lease = max(LEAST_LEASE, 2.0 * deadline)
+    return Network(listen, connect, options.wait, lease=lease, credentials=credentials, problem=problem)
 
 
 def _stop_with_launcher() -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
-import re
-import socket
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,9 +20,7 @@ def add_keys_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_security_options(parser: argparse.ArgumentParser) -> None:
-    """Add --keys and --insecure; `secured` heeds them."""
-    add_keys_option(parser)
+def add_insecure_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--insecure", action="store_true", help="listen where other machines reach it without --keys: they can do all"
     )
@@ -46,36 +42,24 @@ def credentials_of(options: argparse.Namespace, who: str, problem: Problem | Non
     return credentials
 
 
-def refuse_insecure(option: str, address: str, *, keys: Path | None, insecure: bool) -> None:
-    """Raise InputError where an address does not go with --keys, or others could listen in and take part there."""
-    is_tls = address.startswith("tls/")
-    if keys is not None and not is_tls:
+def refuse_insecure(listen: str, connect: Iterable[str], *, keys: Path | None, insecure: bool) -> None:
+    """Raise InputError where addresses do not go with --keys, or others could take part there without."""
+    from agent.network.addresses import MULTICAST, NONE, reaches_other_machines
+
+    if keys is not None and listen == NONE:
         raise InputError(
-            f"{option} {address}: with --keys everything is encrypted; an address looks like tls/127.0.0.1:7447"
+            "--listen none: with --keys everybody must listen, for whoever passed on what others say could say anything"
         )
-    if keys is None and is_tls:
-        raise InputError(f"{option} {address}: there is no TLS without --keys FOLDER, which peakmesh keys init makes")
-    if keys is None and option == "--listen" and not insecure and not is_local(address):
+    for option, address in (("--listen", listen), *(("--connect", address) for address in connect)):
+        is_tls = address.startswith("tls/")
+        if keys is not None and not is_tls and address != MULTICAST:
+            raise InputError(
+                f"{option} {address}: with --keys everything is encrypted; an address looks like tls/127.0.0.1:7447"
+            )
+        if keys is None and is_tls:
+            raise InputError(f"{option} {address}: there is no TLS without --keys FOLDER; peakmesh keys init makes it")
+    if keys is None and not insecure and reaches_other_machines(listen):
         raise InputError(
-            f"--listen {address}: other machines could take part and forge everything; "
+            f"--listen {listen}: other machines could take part and forge everything; "
             "--keys FOLDER keeps them out, --insecure lets them in"
         )
-
-
-def is_local(address: str) -> bool:
-    """Whether only this machine reaches an address. Raises InputError for a host that is not known."""
-    protocol, _, place = address.partition("/")
-    if protocol.startswith("unix"):
-        return True
-    found = re.match(r"\[([^\]]*)\]|([^:#?]*)", place)
-    assert found is not None
-    return is_loopback(found[1] or found[2])
-
-
-def is_loopback(host: str) -> bool:
-    """Of all addresses that a host has. Raises InputError where it has none."""
-    try:
-        found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None)}
-    except (OSError, UnicodeError):
-        raise InputError(f'there is no host "{host}"') from None
-    return all(ipaddress.ip_address(each.partition("%")[0]).is_loopback for each in found)

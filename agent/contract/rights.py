@@ -21,7 +21,9 @@ from agent.contract.keys import (
     alive,
     data_topics,
     estimate,
+    joining,
     key,
+    leaving,
     measurement,
     node_who,
     participants,
@@ -70,7 +72,7 @@ def _rights(who: str, problem: Problem, run: str) -> Rights:
     own = refused(who, "*"), session(who, "*")
     words = {COORDINATOR: [CONTROL], RECORDER: [ACKNOWLEDGED]}.get(who, [])
     return Rights(
-        says=keys(*data, *map(watch, data), *words, own[0], ready(who)),
+        says=keys(*data, *map(watch, data), *words, own[0], joining(who), leaving(who), ready(who)),
         hears=[key(run, topic) for topic in (*_heard(who, problem), own[0])],
         shows=keys(alive(who), own[1]),
         sees=keys(alive("*"), own[1]),
@@ -91,7 +93,7 @@ def _heard(who: str, problem: Problem) -> list[str]:
     if who == RECORDER:
         return [*data_topics(problem), EVENT, ACCOUNT, ready("*"), CONTROL]
     if who == COORDINATOR:
-        return [ACCOUNT, ACKNOWLEDGED, ready("*")]
+        return [ACCOUNT, ACKNOWLEDGED, joining("*"), leaving("*"), ready("*")]
     if who == PLANT:
         return [MODE, CONTROL, ACKNOWLEDGED]
     i = next(i for i, name in enumerate(problem.node_names) if node_who(name) == who)

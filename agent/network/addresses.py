@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import re
 import socket
@@ -27,8 +28,7 @@ def refuse_addresses(*, listen: str, connect: Iterable[str]) -> None:
 
 def reaches_other_machines(address: str) -> bool:
     """Whether somebody on another machine can connect to this address; a name counts as one that can be reached."""
-    host = _host(address)
-    return _protocol(address) in WITH_PORT and not (host == "localhost" or host == "::1" or host.startswith("127."))
+    return _protocol(address) in WITH_PORT and not _is_loopback(_host(address))
 
 
 def _refuse(option: str, address: str, what: str, *, least_port: int) -> None:
@@ -60,6 +60,13 @@ def _refuse_place(said: str, place: str, *, least_port: int) -> None:
     except (OSError, UnicodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is no name"
         raise InputError(f"{said}: the host {host} is not known here: {why}") from None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name
 
 
 def _protocol(address: str) -> str:

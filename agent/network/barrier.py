@@ -167,7 +167,7 @@ class Barrier:
             return f"{in_words(self._left)} left before the run had started{f'; it said: {reason}' if reason else ''}"
         if self._words.alone and self.network.connect:
             where = ", ".join(self.network.connect)
-            return (
+            return self.network.refusal() or (
                 f'nobody of run "{self._run}" answered at {where} within {seconds:g} s; '
                 "is the coordinator running there, under the same --run?"
             )

@@ -270,52 +270,6 @@ class Bus:
                         heed(word)
         raise RunBroken(f"the recorder did not greet {in_words(self.who)} within {seconds:g} s; start it again")
 
-    def wait_for_start(self) -> Control:
-        """The coordinator's order to start, with the facts of the run."""
-        deadline = time.monotonic() + self.network.wait
-        return self._wait_for(Control, deadline=deadline, missing={COORDINATOR})
-
-    def _wait_for(self, kind: type[T], *, deadline: float, missing: set[str]) -> T:
-        """The next word of one kind; what else comes is kept for `receive`."""
-        if (early := self._words.early(kind)) is not None:
-            return early
-        left = ""  # who went away; the coordinator's word on it may be on its way
-        while True:
-            word = self._words.take(deadline)
-            if word is None:
-                if time.monotonic() >= deadline:
-                    raise RunBroken(left or self._who_is_missing(missing))
-                continue
-            match word:
-                case Control(order="close" | "stop"):
-                    raise RunClosed(word)
-                case Control(step=step) if kind is not Control and step:
-                    raise UnderWay(word)
-                case Namesake(identity=identity):
-                    self._heed_namesake(identity)
-                    continue
-                case Ready(underway=True):
-                    raise Orphaned(word)
-                case Peer(who=who, present=False) if who in self._expected:
-                    left = left or f"{in_words(who)} left before the run had started"
-                    deadline = min(deadline, time.monotonic() + (0.0 if self.who == COORDINATOR else LEAVE_SECONDS))
-                    continue
-            if isinstance(word, kind):
-                return word
-            self._words.set_aside(word)
-
-    def _who_is_missing(self, missing: set[str]) -> str:
-        if self._words.alone and self.network.connect:
-            where = ", ".join(self.network.connect)
-            if why := self.network.refusal():
-                return why
-            return (
-                f'nobody of run "{self.run}" answered at {where} within {self.network.wait:g} s; '
-                "is the coordinator running there, under the same --run?"
-            )
-        names = " and ".join(map(in_words, sorted(missing)))
-        return f"{names} did not join the run within {self.network.wait:g} s"
-
     # Run.
     def publish(self, topic: str, message: Message) -> None:
         """Send a data message, and keep it until the recorder has it."""

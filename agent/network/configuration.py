@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 from agent.contract.problem import Problem
 from agent.network.access import access_control
+from agent.network.addresses import MULTICAST, NONE
 from agent.network.credentials import Credentials
 from agent.network.links import Sockets
 
-LEASE_MS = 10_000  # a peer that is silent for so long is lost; a killed one is seen in milliseconds
+ATTEMPT_MS = 500  # that a client tries to connect before it looks up
 ENVELOPE = 4096  # bytes of Zenoh's own around the largest message: its key, its time, its encoding
 BUFFER = 16_384  # bytes, of each direction of each link; messages are small, links are many
 MANY = 1000  # more than anybody has links
@@ -37,19 +38,19 @@ class Network:
     credentials: Credentials | None = None  # with them, everybody must show some
     problem: Problem | None = None  # says what whose credentials allow; without it, whoever has some is believed
 
-    def refusal(self) -> str:
-        """Why nobody to whom it connects is reached, where certificates are the reason; otherwise ""."""
-        own = self.credentials
-        return next(filter(None, map(own.why_not, self.connect)), "") if own is not None else ""
-
     @property
     def kind(self) -> Literal["peer", "client", "router"]:
         """What this is to Zenoh."""
         return "router" if self.routes else "client" if self.listen == NONE else "peer"
 
+    def refusal(self) -> str:
+        """Why nobody to whom it connects is reached, where certificates are the reason; otherwise ""."""
+        own = self.credentials
+        return next(filter(None, map(own.why_not, self.connect)), "") if own is not None else ""
+
 
 def zenoh_configuration(network: Network, *, run: str) -> dict[str, Any]:
-    """Peer mode without multicast: one known address is enough, gossip makes the mesh.
+    """One known address is enough: gossip makes the mesh of the peers.
 
     Peers connect in the background, so that a signal is heeded meanwhile; the barrier waits for everybody.
     """

@@ -7,6 +7,8 @@ is handed over as a duty, for the main thread to do.
 from __future__ import annotations
 
 import json
+import math
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -64,6 +66,8 @@ class Session:
         self._shown: dict[str, zenoh.Publisher] = {}  # the same for viewers
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
+        self._kind = network.kind
+        self.traced = False  # whether messages are to say when they were where
         self._largest = network.largest
         self._zenoh = _open(network, run)
         self._zid = str(self._zenoh.zid())
@@ -101,7 +105,8 @@ class Session:
     def publish(self, sent: Sent) -> None:
         """Send a message of an advertised topic; where a viewer is there, to it too, as long as it keeps up."""
         self._refuse_larger(sent.topic, sent.payload)
-        self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode())
+        traced = TRACED if self.traced else None
+        self._publishers[sent.topic].put(sent.payload, attachment=sent.stamp.encode(), timestamp_instrumentation=traced)
         if self._watched[sent.topic]:
             self._shown[sent.topic].put(sent.payload)
 
@@ -264,9 +269,22 @@ def _replayed(reply: zenoh.Reply) -> Sample | None:
 
 
 def _open(network: Network, run: str) -> zenoh.Session:
-    try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(zenoh_configuration(network, run=run))))
-    except zenoh.ZError as error:
-        reason = str(error)
-        cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
-        raise InputError(f"cannot listen on {network.listen}: {cause}; port 0 takes a free one") from None
+    """A client is there once it is connected; signals are heeded between its attempts."""
+    config, deadline = json.dumps(zenoh_configuration(network, run=run)), time.monotonic() + network.wait
+    while True:
+        try:
+            return zenoh.open(zenoh.Config.from_json5(config))
+        except zenoh.ZError as error:
+            if network.kind != "client":
+                raise _not_open(network, str(error)) from None
+        if time.monotonic() >= deadline:
+            where = ", ".join(network.connect)
+            raise RunBroken(f"nobody answered at {where} within {network.wait:g} s; is the coordinator running there?")
+
+
+def _not_open(network: Network, reason: str) -> InputError:
+    """An address that looks well, and which Zenoh cannot use all the same."""
+    cause = "the port is in use" if "in use" in reason else reason.split(" at /")[0]
+    if "in use" in reason or "listen" in reason.lower() or not network.connect:
+        return InputError(f"cannot listen on {network.listen}: {cause}; port 0 takes a free one")
+    return InputError(f"cannot connect to {', '.join(network.connect)}: {cause}")

@@ -24,7 +24,7 @@ from agent.contract.recording.parts import unfinished
 from designer.replay import replay
 
 SEED = ("--connect", "tcp/10.77.0.1:7447")  # the coordinator, on host 1
-ANYWHERE = ("--listen", "tcp/0.0.0.0:0")
+ANYWHERE = ("--insecure", "--listen", "tcp/0.0.0.0:0")
 Role = tuple[int, list[object]]  # on which host, and its command line
 
 
@@ -55,9 +55,9 @@ def test_the_lossy_example_across_three_hosts(three: Hosts, tmp_path: Path) -> N
     """Over IPv6, with clocks that are minutes apart: everything arrives, and the replay agrees."""
     file, recording = GOLDEN / "zhu2020-lossy.gains.json", tmp_path / "run.mcap"
     gains = Gains.load(file)
-    network = ["--connect", "tcp/[fd77::1]:7447", "--listen", "tcp/[::]:0"]
+    network = ["--connect", "tcp/[fd77::1]:7447", "--insecure", "--listen", "tcp/[::]:0"]
     roles: dict[str, Role] = {
-        "coordinator": (1, ["coordinator", file, "--listen", "tcp/[::]:7447", "--steps", 60]),
+        "coordinator": (1, ["coordinator", file, "--insecure", "--listen", "tcp/[::]:7447", "--steps", 60]),
         "recorder": (1, ["recorder", file, "-o", recording, *network]),
         "plant": (3, ["plant", file, *network]),
     }
@@ -78,7 +78,7 @@ def with_pair(
     """Coordinator and recorder on host 1 with the plant, a node on host 2 and one on host 3."""
     first, second = pair.problem.node_names
     return {
-        "coordinator": (1, ["coordinator", file, "--listen", "tcp/0.0.0.0:7447", *plan]),
+        "coordinator": (1, ["coordinator", file, "--insecure", "--listen", "tcp/0.0.0.0:7447", *plan]),
         "recorder": (1, ["recorder", file, "-o", recording, *network]),
         "plant": (1, ["plant", file, *network]),
         "first": (2, ["node", file, "--node", first, *network]),
@@ -132,7 +132,7 @@ def test_hosts_that_cannot_reach_one_another_find_the_coordinator_by_multicast(
     recording, node = tmp_path / "run.mcap", Gains.load(lone_path).problem.node_names[0]
     found = ["--connect", "multicast"]
     roles: dict[str, Role] = {
-        "coordinator": (1, ["coordinator", lone_path, "--listen", "tcp/0.0.0.0:0", "--steps", 60, *found]),
+        "coordinator": (1, ["coordinator", lone_path, "--insecure", "--listen", "tcp/0.0.0.0:0", "--steps", 60, *found]),
         "recorder": (1, ["recorder", lone_path, "-o", recording, *ANYWHERE, *found]),
         "node": (2, ["node", lone_path, "--node", node, *ANYWHERE, *found]),
         "plant": (3, ["plant", lone_path, "--listen", "none", *found]),
