@@ -56,6 +56,8 @@ def refuse_insecure(listen: str, connect: Iterable[str], *, keys: Path | None, i
             raise InputError(
                 f"{option} {address}: with --keys everything is encrypted; an address looks like tls/127.0.0.1:7447"
             )
+        if is_tls and "[" in address:
+            raise InputError(f"{option} {address}: Zenoh's TLS has no IPv6 addresses; give one of IPv4")
         if keys is None and is_tls:
             raise InputError(f"{option} {address}: there is no TLS without --keys FOLDER; peakmesh keys init makes it")
     if keys is None and not insecure and reaches_other_machines(listen):

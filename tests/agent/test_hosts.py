@@ -16,15 +16,19 @@ from hosts import Hosts
 from places import GOLDEN
 from runs import PATIENCE, decoded, line_with, logged, started
 
+from agent.authority import Authority
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.keys import ACCOUNT
 from agent.contract.messages import Event
 from agent.contract.recording.parts import unfinished
+from agent.contract.rights import everybody
 from designer.replay import replay
 
 SEED = ("--connect", "tcp/10.77.0.1:7447")  # the coordinator, on host 1
 ANYWHERE = ("--insecure", "--listen", "tcp/0.0.0.0:0")
+LISTEN = ("--insecure", "--listen", "tcp/0.0.0.0:7447")
+Words = tuple[object, ...]
 Role = tuple[int, list[object]]  # on which host, and its command line
 
 
@@ -73,12 +77,12 @@ def test_the_lossy_example_across_three_hosts(three: Hosts, tmp_path: Path) -> N
 
 
 def with_pair(
-    file: Path, pair: Gains, recording: Path, network: list[object], *, plan: list[object]
+    file: Path, pair: Gains, recording: Path, network: list[object], *, plan: list[object], listen: Words = LISTEN
 ) -> dict[str, Role]:
     """Coordinator and recorder on host 1 with the plant, a node on host 2 and one on host 3."""
     first, second = pair.problem.node_names
     return {
-        "coordinator": (1, ["coordinator", file, "--insecure", "--listen", "tcp/0.0.0.0:7447", *plan]),
+        "coordinator": (1, ["coordinator", file, *listen, *plan]),
         "recorder": (1, ["recorder", file, "-o", recording, *network]),
         "plant": (1, ["plant", file, *network]),
         "first": (2, ["node", file, "--node", first, *network]),
@@ -97,10 +101,14 @@ def wait_for_accounts(part: Path, count: int) -> None:
 
 
 def test_a_cable_is_pulled_and_put_back(three: Hosts, pair_path: Path, pair: Gains, tmp_path: Path) -> None:
-    """For five seconds, against the clock: the others go on, and who was cut off is there again."""
-    recording, steps = tmp_path / "run.mcap", 160
+    """For five seconds, against the clock, with keys: the others go on, and who was cut off is there again."""
+    recording, steps, keys = tmp_path / "run.mcap", 160, tmp_path / "keys"
+    keys.mkdir()
+    Authority.create(keys, pair.problem.name, days=1).issue(everybody(pair.problem), days=1)
     plan = ["--steps", steps, "--period", "100ms", "--seed", 3]
-    roles = with_pair(pair_path, pair, recording, network=[*SEED, *ANYWHERE], plan=plan)
+    network = ["--keys", keys, "--connect", "tls/10.77.0.1:7447", "--listen", "tls/0.0.0.0:0"]
+    listen = ("--keys", keys, "--listen", "tls/0.0.0.0:7447")
+    roles = with_pair(pair_path, pair, recording, network, plan=plan, listen=listen)
     with ExitStack() as stack:
         processes = go(three, roles, stack)
         line_with(processes[0], "the run starts")
@@ -132,7 +140,10 @@ def test_hosts_that_cannot_reach_one_another_find_the_coordinator_by_multicast(
     recording, node = tmp_path / "run.mcap", Gains.load(lone_path).problem.node_names[0]
     found = ["--connect", "multicast"]
     roles: dict[str, Role] = {
-        "coordinator": (1, ["coordinator", lone_path, "--insecure", "--listen", "tcp/0.0.0.0:0", "--steps", 60, *found]),
+        "coordinator": (
+            1,
+            ["coordinator", lone_path, "--insecure", "--listen", "tcp/0.0.0.0:0", "--steps", 60, *found],
+        ),
         "recorder": (1, ["recorder", lone_path, "-o", recording, *ANYWHERE, *found]),
         "node": (2, ["node", lone_path, "--node", node, *ANYWHERE, *found]),
         "plant": (3, ["plant", lone_path, "--listen", "none", *found]),

@@ -44,6 +44,7 @@ def test_keys_and_tls_go_together() -> None:
     for listen, connect, given, sentence in (
         (plain, encrypted, keys, f"--listen {plain}: with --keys everything is encrypted; an address looks like tls/"),
         (encrypted, plain, keys, f"--connect {plain}: with --keys everything is encrypted; an address looks like tls/"),
+        (encrypted, "tls/[::1]:1", keys, "--connect tls/[::1]:1: Zenoh's TLS has no IPv6 addresses; give one of IPv4"),
         (
             "none",
             encrypted,
