@@ -1,6 +1,6 @@
 """The real run beside the same run over raw AF_UNIX sockets, in one invocation.
 
-    python benchmarks/lockstep.py [--steps 3000] [--repeat 3] [GAINS]
+    python benchmarks/lockstep.py [--steps 3000] [--repeat 3] [--keys FOLDER] [GAINS]
 
 Prints rounds per second as medians, the ratio to both orders of the reference, CPU time and context switches per round
 of every process, resident memory, and the seconds from the start of the command to step 0. The estimates of all runs
@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--window", type=int, action="append", help="of peakmesh; may be repeated (its default)")
+    parser.add_argument("--keys", type=Path, help="once more with these, over TLS in place of Unix sockets")
     options = parser.parse_args()
     gains = Gains.load(options.gains)
     rates: dict[str, list[float]] = {}
@@ -51,6 +52,10 @@ def main() -> None:
             run = peakmesh(options.gains, gains, options.steps, window)
             assert run["digests"] == digests, "the runs differ"
             rates.setdefault("peakmesh" if window is None else f"peakmesh, window {window}", []).append(run["rate"])
+        if options.keys is not None:
+            run = peakmesh(options.gains, gains, options.steps, None, "--keys", options.keys)
+            assert run["digests"] == digests, "the runs differ"
+            rates.setdefault("peakmesh, with keys", []).append(run["rate"])
     strict, windowed = (statistics.median(rates[name]) for name in ("AF_UNIX, strict", "AF_UNIX, window 32"))
     print(f"{'':24} rounds/s   (of {options.repeat}: least, most)   of strict   of windowed AF_UNIX")
     for name, several in rates.items():
@@ -68,13 +73,14 @@ def main() -> None:
     print(f"  {'together':14} {whole:5.0f} us of processor time, {1e6 / run['rate']:.0f} us passed")
 
 
-def peakmesh(path: Path, gains: Gains, steps: int, window: int | None) -> dict[str, Any]:
+def peakmesh(path: Path, gains: Gains, steps: int, window: int | None, *more: object) -> dict[str, Any]:
     """One real run: its rate, what its processes used, and a digest of each node's estimates."""
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "run.mcap"
         command = [sys.executable, "-m", "agent", "run", str(path), "--json", "-o", str(recording)]
         command += ["--steps", str(steps), "--seed", str(SEED)]
         command += [] if window is None else ["--window", str(window)]
+        command += map(str, more)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         watcher = Watcher(process.pid, recording.with_name("run.mcap.part"))
         watcher.start()

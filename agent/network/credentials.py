@@ -132,7 +132,7 @@ class Credentials:
 
     def why_not(self, address: str) -> str:
         """Why we and who listens at `address` do not understand each other, as a sentence; "" where it is not known."""
-        found = re.fullmatch(r"tls/\[?([^\]/]+)\]?:(\d+)", address)
+        found = re.fullmatch(r"tls/([^:/]+):(\d+)", address)
         if found is None:
             return ""
         try:

@@ -96,7 +96,7 @@ def test_strangers_find_everybody(tmp_path: Path) -> None:
     """
     hub, other = (f"unixsock-stream/{tmp_path / who}" for who in (COORDINATOR, PLANT))
     inside = Network("", (), PATIENCE, sockets=Sockets(other, (hub,)))
-    least = int(zenoh_configuration(inside)["id"], 16)
+    least = int(zenoh_configuration(inside, run="test")["id"], 16)
     assert max(least.to_bytes(16, order)[:4] for order in ("little", "big")) == bytes(4)
     with (
         Bus(Network(wait=PATIENCE, sockets=Sockets(hub, ())), run="test", who=COORDINATOR) as coordinator,
