@@ -20,6 +20,7 @@ import tempfile
 import threading
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -132,26 +133,32 @@ def run(
     return json.loads(said), dict(lives)
 
 
-def seen(parent: int, at: float) -> list[tuple[str, Sample]]:
+def seen(launcher: int, at: float) -> list[tuple[str, Sample]]:
     """Every role below a process, by its name and process id."""
-    parents, found = {parent}, []
-    for entry in sorted((int(path.name), path) for path in Path("/proc").iterdir() if path.name.isdecimal()):
-        pid, path = entry
-        try:
-            fields = (path / "stat").read_text().rpartition(")")[2].split()
-            if int(fields[1]) not in parents:
-                continue
-            parents.add(pid)
-            words = (path / "cmdline").read_text().replace("\0", " ").split()
+    found, parents = [], {}
+    for path in Path("/proc").iterdir():
+        with suppress(OSError, ValueError, IndexError):  # no process, or it has ended meanwhile
+            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+    for pid in parents:
+        with suppress(OSError, IndexError):
+            words = Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ").split()
             role = next((word for word in words if word in ROLES), None)
-            if role is None:
+            if role is None or launcher not in ancestors(pid, parents):
                 continue
             whose = f" {words[words.index('--node') + 1]}" if role == "node" else ""
-            memory = int(fields[21]) * os.sysconf("SC_PAGE_SIZE") // 1024
-            if memory and (descriptors := len(os.listdir(path / "fd"))):  # neither is there of one that is just ending
+            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+            descriptors = len(os.listdir(f"/proc/{pid}/fd"))
+            if pages and descriptors:  # neither is there of one that is just ending
+                memory = pages * os.sysconf("SC_PAGE_SIZE") // 1024
                 found.append((f"{role}{whose} ({pid})", Sample(at, memory, descriptors)))
-        except (OSError, IndexError):
-            continue  # it has ended meanwhile
+    return found
+
+
+def ancestors(pid: int, parents: dict[int, int]) -> set[int]:
+    """Of a process; where one has ended in between, as far as is known."""
+    found: set[int] = set()
+    while (pid := parents.get(pid, 0)) and pid not in found:
+        found.add(pid)
     return found
 
 

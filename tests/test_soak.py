@@ -61,6 +61,12 @@ def test_every_process_is_looked_at(soaked: tuple[dict[str, Any], dict[str, list
     assert all(sample.memory > 1000 for samples in lives.values() for sample in samples)
 
 
+def test_numbers_of_processes_begin_anew() -> None:
+    """Who is started later may have a lower one."""
+    assert soak.ancestors(7, {7: 30_000, 30_000: 29_000, 29_000: 1, 5: 4}) == {30_000, 29_000, 1}
+    assert soak.ancestors(5, {5: 4}) == {4}
+
+
 def life(memory: float = 0.0, descriptors: float = 0.0) -> dict[str, list[Sample]]:
     """Of 200 s, with so much growth in all, and some noise."""
     return {

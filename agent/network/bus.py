@@ -51,6 +51,7 @@ from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Channel, Session
 from agent.network.words import (
+    ChannelClosed,
     Incoming,
     Namesake,
     Peer,
@@ -98,6 +99,7 @@ class Bus:
         self._last_word: Acknowledged | None = None  # that the recording is closed
         self._ready: Ready | None = None  # what we have told the coordinator
         self.has_begun = False  # the run, for us
+        self.is_over = False  # what would be published now would not be recorded
         self.is_late = False  # joined while the run went on
         self.patient = False  # in a paced run: a coordinator that is lost may come back
         self._given_up = math.inf  # when it is not waited for any more
@@ -272,7 +274,9 @@ class Bus:
 
     # Run.
     def publish(self, topic: str, message: Message) -> None:
-        """Send a data message, and keep it until the recorder has it."""
+        """Send a data message, and keep it until the recorder has it. Raises ChannelClosed where the run is over."""
+        if self.is_over:
+            raise ChannelClosed
         self._session.publish(self._outbox.add(topic, message.encode()))
 
     def trace(self) -> None:

@@ -80,7 +80,7 @@ class Refused(InputError):
 
 
 class ChannelClosed(Exception):
-    """Raised by `Channel.next` when this participant leaves."""
+    """Raised by `Channel.next` when this participant leaves, and by `Bus.publish` when the run is over."""
 
 
 class Words:

@@ -73,6 +73,7 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
         while True:
             bus.receive()
     except RunClosed as closed:
+        bus.is_over = True
         last_word = bus.wait_for_close()
         if closed.control.order == "stop":
             raise RunBroken(closed.control.reason) from None

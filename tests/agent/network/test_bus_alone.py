@@ -12,10 +12,10 @@ import pytest
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, RECORDER
-from agent.contract.messages import Acknowledged, Control, Ready
+from agent.contract.messages import Acknowledged, Control, Mode, Ready
 from agent.network.bus import Bus
 from agent.network.configuration import Network
-from agent.network.words import Duty, Incoming, Orphaned, Peer, Refused, Replayed, RunClosed, Sample
+from agent.network.words import ChannelClosed, Duty, Incoming, Orphaned, Peer, Refused, Replayed, RunClosed, Sample
 from agent.roles.joining import join
 
 SAMPLE = Sample("mode", b"", None)
@@ -131,3 +131,13 @@ def test_a_late_recorder_waits_for_whom_it_has_not_seen(recorder: Bus) -> None:
     recorder.wait_until_there(["node-n0"])
     assert recorder._words.take(time.monotonic()) == SAMPLE
     assert recorder._words.take(-math.inf) is None
+
+
+def test_nothing_is_published_when_the_run_is_over(node: Bus) -> None:
+    """Nobody would record it; whoever computes ends there."""
+    node.publish("mode", Mode(step=0, mode="a"))
+    assert node.unrecorded == 1
+    node.is_over = True
+    with pytest.raises(ChannelClosed):
+        node.publish("mode", Mode(step=1, mode="a"))
+    assert node.unrecorded == 1

@@ -13,6 +13,7 @@ from agent.contract.keys import COORDINATOR, estimate, node_who
 from agent.contract.recording.parts import files_of
 from agent.network.words import Refused
 from designer.replay import replay
+from simulated.network import LEASE
 from simulated.world import Outcome, place_of
 
 
@@ -40,6 +41,22 @@ def a_fair_run_succeeds(outcome: Outcome) -> Iterator[str]:
                 yield f"{member.process.name} gave up though nothing had happened: {member.sentence}"
         if outcome.summary is not None and (missing := outcome.summary.missing):
             yield f"{missing} messages are missing though nothing had happened"
+
+
+def a_paced_run_survives(outcome: Outcome) -> Iterator[str]:
+    """Whoever is killed, stands still or is cut off for less than the lease, once it has begun and before it ends."""
+    scenario = outcome.scenario
+    if scenario.plan.pace is None or outcome.summary is not None:
+        return
+    kinds = {trouble.kind for trouble in scenario.troubles}
+    times = [trouble.at for trouble in scenario.troubles]
+    steps = [int(fault.rpartition("step=")[2].partition(",")[0]) for fault in scenario.plan.faults if "step=" in fault]
+    in_time = all(0.0 <= at <= LAST for at in [*times, *(step / scenario.plan.steps for step in steps)])
+    in_time &= all(trouble.seconds < LEASE for trouble in scenario.troubles)
+    at_once = any(f"kill:{COORDINATOR},step=0" in fault for fault in scenario.plan.faults)  # it dies of it every time
+    if in_time and not at_once and kinds <= {"kill", "freeze", "part"}:
+        last = [member for member in outcome.members if member.who == COORDINATOR][-1]
+        yield f"the run did not survive: {last.sentence}"
 
 
 def what_succeeds_is_recorded(outcome: Outcome) -> Iterator[str]:
@@ -133,10 +150,12 @@ def _is_untouched(outcome: Outcome, who: str) -> bool:
     )
 
 
+LAST = 0.6  # part of a run after which who is killed may not be back before it ends
 LAWS: tuple[Callable[[Outcome], Iterator[str]], ...] = (
     nobody_hangs,
     everybody_ends_with_an_honest_word,
     a_fair_run_succeeds,
+    a_paced_run_survives,
     what_succeeds_is_recorded,
     the_replay_agrees,
     nobody_runs_twice,
