@@ -237,8 +237,8 @@ def _bracket(operator: Operator, horizon: int, invariant: InvariantSet | None, w
     recursion held give p and the root; where that leads nowhere, g is tried a fifth above low. Where it has not come
     to its end at some g, the bracket stays wider.
     """
-    low, steps, growth, tiny = 0.0, 1, 2.0, float(np.finfo(float).tiny)
-    g = growth * max(_impulse(operator), tiny)
+    low, steps, growth, tiny, first = 0.0, 1, 2.0, float(np.finfo(float).tiny), _impulse(operator)  # first: one step's
+    g = growth * max(first, tiny)
     held: list[tuple[float, float]] = []  # (g, log of the product of all W), falling
     while not held or held[-1][0] > max(low * (1.0 + 1.001 * width), 2.0 * tiny):
         if not math.isfinite(g):
@@ -246,20 +246,19 @@ def _bracket(operator: Operator, horizon: int, invariant: InvariantSet | None, w
         trial = recursion_holds(operator, g, horizon, invariant=invariant)
         if trial.holds:
             held = [*held[-2:], (g, trial.measure)]
-        elif trial.holds is None and held:
+        elif trial.holds is False:
+            low, steps, growth = g, trial.steps, growth * growth
+        elif held:
             break
-        else:
-            growth *= growth
-            low, steps = (g, trial.steps) if trial.holds is False else (low, steps)
-        g = _next_trial(low, held, width, fit=bool(trial.holds)) if held else growth * max(low, g)
-    return _Bracket(low, held[-1][0], steps)
+        g = _next_trial(low, held, width, fit=bool(trial.holds)) if held else growth * g
+    return _Bracket(max(low, 0.5 * first), held[-1][0], steps)
 
 
 def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:
     """Where to try g next, strictly inside the bracket: at the fitted root, or a fifth above low after that failed."""
     (high, measure), least = held[-1], 0.4 * width
     root = None
-    if fit:
+    if fit and measure < 0.0:  # else g is so large that the log of W is 0
         root = _root(low, held) if len(held) == 3 else -high * math.expm1(measure)  # as if one W did it all
     if high - low < 8.0 * width * high:  # close the bracket from the other side
         root = (root or low) if high > low * (1.0 + 3.0 * least) else None

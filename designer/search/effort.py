@@ -7,6 +7,7 @@ estimate was. It is of the whole search, whose end a budget may come before.
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def seconds_of_exact(problem: Problem) -> float:
 
 def gradients_of_exact(problem: Problem) -> float:
     """Estimated number of gradients over 20 steps; one over 40 counts twice."""
-    return _GRADIENTS * min(max(problem.n / 6.0, 1.0), _MORE)
+    return _GRADIENTS * min(math.pow(max(problem.n / 6.0, 1.0), 1.4), _MORE)
 
 
 def whole_fits(problem: Problem, *, free: float | None = None) -> bool:

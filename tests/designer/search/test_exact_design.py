@@ -117,3 +117,23 @@ def test_what_windows_led_to_is_certified_whatever_ends_the_search(why: str, mon
     assert gains.solver.status.startswith(f"{why}; from ")
     assert (gains.solver.iterations > 0) == (why == "converged")
     assert verify(gains).holds
+
+
+@pytest.mark.parametrize("phase", ["_keep", "_follow", "_is_short", "_centre", "choose", "_near", "confirmed"])
+def test_ctrl_c_in_any_phase_leaves_gains_that_are_certified(phase: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pressed once, as the phase begins for the first time."""
+    place = exact_design if phase == "confirmed" else descent._Search
+    proper, pressed = getattr(place, phase), []
+
+    def interrupted(*words: Any, **options: Any) -> Any:
+        if not pressed:
+            pressed.append(phase)
+            raise KeyboardInterrupt
+        return proper(*words, **options)
+
+    monkeypatch.setattr(place, phase, interrupted)
+    monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:2])
+    problem = find("two-nodes")
+    gains = design_exact(problem, starts={"least variance": least_variance_gains(problem)})
+    assert pressed
+    assert verify(gains).holds
