@@ -586,7 +586,7 @@ def test_what_grows_unseen_does_not_matter_where_a_measurement_shows_all_of_w() 
 
 
 def slow(a: float) -> Case:
-    """One node that hardly listens to an integrator that leaks, losses hidden: E|error|^2 decays by a^2 in each step."""
+    """One node that hardly listens to a leaking integrator, losses hidden: E|error|^2 decays by a^2 in each step."""
     problem = Problem.from_document(
         {
             "name": "slow",
