@@ -167,7 +167,7 @@ def _solved(L: Map, modes: int, n: int) -> Array | None:
 
 
 def lasting(L: Map, first: Array) -> tuple[Array, float] | None:
-    """X >= 0 and its eigenvalue, the spectral radius of L, in what L makes of `first`, (modes, n, n); None: not found."""
+    """X >= 0 with L(X) = lambda X for the largest lambda in what L makes of `first`, and lambda; None: not found."""
     from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
     pack, unpack = _packing(*first.shape[:2])

@@ -23,10 +23,11 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from agent.contract.errors import counted
 from agent.contract.problem import Problem
 from designer.ledger.account import Account
-from agent.contract.errors import counted
 from designer.ledger.deviation import Deviation
 from designer.replay import free_run, proofs
 from designer.replay.central import Central
