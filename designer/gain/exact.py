@@ -203,7 +203,7 @@ class Escape(NamedTuple):
 def escape(operator: Operator, P: Array) -> Escape | None:
     """For the policy that is worst against P, a P that is nearly the largest; None where nothing lasts under it."""
     n, S = operator.size, operator.of(P)
-    Gamma = np.linalg.solve(operator.eye_w - S[:, n:, n:], S[:, n:, :n])
+    Gamma = np.asarray(np.linalg.solve(operator.eye_w - S[:, n:, n:], S[:, n:, :n]), dtype=np.float64)
 
     def carry(X: Array) -> Array:
         return operator.carry(_joint(X, Gamma))

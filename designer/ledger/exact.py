@@ -81,7 +81,7 @@ class Ledger:
     def anew(self, k: int) -> Ledger:
         """One of the same network that stands at step k, and has been told nothing."""
         models = self.models
-        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._set.P)
+        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._P)
         other.models, other.k = models, k  # the models that were made
         return other
 

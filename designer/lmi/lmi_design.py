@@ -64,12 +64,11 @@ def ignoring(problem: Problem) -> Designed | None:
     n, modes = problem.n, len(problem.topologies)
     K, H = link_gains(problem, np.tile(np.kron(np.eye(n), problem.plant.A), (modes, 1, 1)), no_measurements(problem))
     M = error_model(problem, *stacked_links(problem, K, H)).M
+    p = problem.plant_states
     for spare in _SPARE if problem.plant.spectral_radius < 1.0 else ():
-        W_inverse = np.linalg.inv(reachable(problem, spare))
+        W_inverse = np.asarray(np.linalg.inv(reachable(problem, spare)), dtype=np.float64)
         Q = np.tile((1.0 - spare) * W_inverse / n, (modes, n, 1, 1))
-        P = block_diagonal(
-            spare * W_inverse if problem.plant_states else np.zeros((0, 0)), (Q + Q.swapaxes(2, 3)) / 2.0
-        )
+        P = block_diagonal(spare * W_inverse[:p, :p], (Q + Q.swapaxes(2, 3)) / 2.0)
         verdict = Prover(problem, K, H, P=P).theorem1(least_gamma(M, P) * (1.0 + 1e-9))
         if verdict.holds:
             return Designed(K, H, Confirmed(P, "structured", 0.0, verdict))

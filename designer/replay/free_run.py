@@ -93,7 +93,7 @@ def _short(S: Array) -> Array:
     """A factor of the same S S' with fewer columns, once there are many more than rows."""
     if S.shape[1] <= 2 * S.shape[0] or not np.isfinite(S).all():
         return S
-    return np.asarray(np.linalg.qr(S.T, mode="r").T)
+    return np.asarray(np.linalg.qr(S.T, mode="r")).T
 
 
 def _delivered_gains(central: Central, s: int, delivered: Flags | None) -> Array:

@@ -42,11 +42,13 @@ def design_exact(
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
+    unit: float = 1.0,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
     `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
     when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
+    `unit`: of z; it counts in the status alone.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
@@ -99,7 +101,7 @@ def design_exact(
         solver=Solver(
             name="barrier descent, numpy",
             version=np.__version__,
-            status=_status(descent),
+            status=_status(descent, unit),
             iterations=descent.steps,
             seconds=solved - begun,
         ),
@@ -215,11 +217,11 @@ def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *
     return verdict
 
 
-def _status(descent: Descent) -> str:
+def _status(descent: Descent, unit: float) -> str:
     """How the search ended and where it began, and what the chosen gains trade for their size and decay."""
     chosen, least = descent.chosen, descent.least
     return (
         f"{descent.ended}; from {descent.start or 'the start'}; "
-        f"least {least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
-        f"chosen {chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
+        f"least {unit * least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
+        f"chosen {unit * chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
     )

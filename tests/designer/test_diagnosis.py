@@ -263,8 +263,8 @@ def test_scales_that_differ_are_said() -> None:
 
     problem = changed(network(), change)
     assert warnings(problem) == [
-        'the largest number in B is 1e-05, and in C of node "2" 20: they differ by more than 1e+06; units in which '
-        "both are near 1 make the solver more exact"
+        'the largest number in B is 1e-05, and in C of node "2" 20: they differ by more than 1e+06; is every unit '
+        "what it should be?"
     ]
 
 
