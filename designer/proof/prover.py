@@ -27,7 +27,7 @@ BALLS: tuple[Make, ...] = tuple(partial(ByBalls, bits=bits) for bits in (128, 25
 _LARGEST_RECURSION = 130
 _LARGEST_INEQUALITY = 450
 _STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
-_STEPS_OF_LOWER_END = 20_000
+MOST_STEPS_BELOW = 20_000
 _STEPS_OF_OTHERS = 5000  # with a P that is to end it early
 
 
@@ -108,7 +108,7 @@ class Prover:
             self._ask(lambda by: recursion(by, modes, gamma, P, most=most), largest=_LARGEST_RECURSION),
         ]
 
-    def at_least(self, gamma: float, *, most: int = _STEPS_OF_LOWER_END) -> str | None:
+    def at_least(self, gamma: float, *, most: int = MOST_STEPS_BELOW) -> str | None:
         """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps."""
         for k in range(len(self._makes)):
             by = self._arithmetic(k)

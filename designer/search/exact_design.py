@@ -18,7 +18,7 @@ from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.prover import BALLS, FLOATS, Prover
+from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
 from designer.search.descent import Budget, Descent, Progress, descend
 from designer.search.effort import in_windows, refuse_without_memory, whole_fits
 from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
@@ -30,6 +30,8 @@ _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
+_BELOW_WHERE_SLOW = (1e-6, 1e-3, 1e-1, 0.5)  # a W fails after many steps, if not far below
+_SLOW = 0.98  # radius
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -188,9 +190,10 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     """
     if problem.n * problem.nx > _PROVED_STATES:
         return gain.low * (1.0 - _BELOW[3])
-    prover = Prover(problem, K, H)
-    tried = (gain.low * (1.0 - part) for part in _BELOW)
-    return next((low for low in tried if low > 0.0 and prover.at_least(low, most=2 * gain.horizon + 10)), 0.0)
+    prover, slow = Prover(problem, K, H), gain.radius > _SLOW
+    most = MOST_STEPS_BELOW if slow else 2 * gain.horizon + 10
+    tried = (gain.low * (1.0 - part) for part in (_BELOW_WHERE_SLOW if slow else _BELOW))
+    return next((low for low in tried if low > 0.0 and prover.at_least(low, most=most)), 0.0)
 
 
 def _advice(problem: Problem) -> str:
