@@ -28,6 +28,11 @@ _FEW = 40  # and up to which its eigenvalues take no time
 _TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to rounding, and Arnoldi's method most of all
 _STEPS = 30  # in which it is looked for
 _HUGE = 1e150
+_STRICT = 1e-3  # by this part of itself P stands below the largest multiple that satisfies (17)
+_STRICT_WHERE_SLOW = 1e-6
+_SLOW = 0.98  # radius from which on one P would end the recursion late
+_ROUNDS = 8
+_FLOOR = 1e-6  # of I that is in every U, so that P > 0
 _REST = 0.25  # what is left of U may be off by, measured by U
 
 
@@ -76,6 +81,52 @@ def is_positive(Z: Array) -> bool:
     return True
 
 
+def invariants(S: Map, found: Decay, units: Array, peak: Array) -> list[Array]:
+    """Every P here satisfies (17) strictly, as far as floats tell; none: `found` has no Z > 0.
+
+    S(Y) is (modes, n + nw, n + nw), L its corner, peak M'M. The first P is of Z. Where errors decay slowly there are
+    two more, of other U: M'M, which suits errors that all move alike; and A'P_bar B W^-1 B'P_bar A, what the worst w
+    adds, taken again and again, until P is as large as can be in the direction that lasts.
+    """
+    if found.total is None or found.rest is None or not found.dies_out:
+        return []
+    modes, n = found.total.shape[:2]
+    first, order = scaled(S, found.total, found.rest), modes * n * (n + 1) // 2
+    if order > _DENSE or found.radius < _SLOW:
+        return [first]
+    both, eye = np.outer(units, units), np.broadcast_to(np.diag(units**2), first.shape)
+    pack, unpack = _packing(modes, n)
+    I_L = np.eye(order) - _matrix(lambda Y: S(Y * both)[:, :n, :n] / both, modes, n)
+    inverse = np.linalg.inv(I_L)
+
+    def of(U: Array, share: float) -> Array | None:
+        U = U + share * float((U.diagonal(axis1=1, axis2=2) / units**2).max()) * eye
+        Z = unpack(inverse @ pack(U / both)) * both
+        rest = Z - S(Z)[:, :n, :n]
+        return scaled(S, Z, rest, _STRICT_WHERE_SLOW) if is_positive(Z) and is_positive(rest) else None
+
+    P, worst = first, [of(peak, _FLOOR)]
+    for k in range(2, 2 + _ROUNDS):
+        grown = S(P)
+        AB, W = grown[:, :n, n:], np.eye(grown.shape[1] - n) - grown[:, n:, n:]
+        following = of(AB @ np.linalg.solve(W, AB.swapaxes(1, 2)), max(10.0**-k, _FLOOR))
+        if following is None:
+            break
+        P = following
+    return [first, *(P for P in (*worst, P) if P is not None)]
+
+
+def scaled(S: Map, Z: Array, rest: Array, strict: float = _STRICT) -> Array:
+    """c Z with the largest c that (17) allows, less a part of it; rest = Z - L(Z) > 0.
+
+    By Schur's complement I > c (B'Z_bar B + B'Z_bar A rest^-1 A'Z_bar B).
+    """
+    grown, n = S(Z), Z.shape[1]
+    AB, BB = grown[:, :n, n:], grown[:, n:, n:]
+    worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(rest, AB)).max())
+    return np.asarray(Z / (worst * (1.0 + strict)) if worst > 0.0 else Z)
+
+
 def _total(L: Map, modes: int, n: int) -> tuple[Array | None, Array | None]:
     """Z and Z - L(Z) for U = I, which is in the middle of what is allowed for."""
     eye = np.broadcast_to(np.eye(n), (modes, n, n))
@@ -113,6 +164,44 @@ def _solved(L: Map, modes: int, n: int) -> Array | None:
     I_L = LinearOperator((order, order), matvec=lambda z: z - pack(L(unpack(z))), dtype=np.float64)
     z, _ = gmres(I_L, right, rtol=_REST / np.sqrt(modes * n), restart=60, maxiter=5)
     return unpack(z)
+
+
+def lasting(L: Map, first: Array) -> tuple[Array, float] | None:
+    """X >= 0 with L(X) = lambda X for the largest lambda in what L makes of `first`, and lambda; None: not found."""
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
+
+    pack, unpack = _packing(*first.shape[:2])
+    start = pack(first)
+    if not start.any():
+        return None
+    if len(start) <= _FEW:  # what L makes of `first` alone: other directions are left out
+        basis = _krylov(lambda y: pack(L(unpack(y))), start)
+        values, vectors = np.linalg.eig(np.array([basis.T @ pack(L(unpack(y))) for y in basis.T]).T)
+        k = int(np.real(values).argmax())
+        X = unpack(basis @ np.real(vectors[:, k]))
+        return (X if np.trace(X, axis1=1, axis2=2).sum() > 0.0 else -X), float(np.real(values[k]))
+    operator = LinearOperator((len(start), len(start)), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
+    try:
+        values, vectors = eigs(operator, k=1, v0=start, which="LR", tol=1e-12, maxiter=100)
+    except ArpackError:
+        return None
+    X = unpack(np.real(vectors[:, 0]))
+    X = X if np.trace(X, axis1=1, axis2=2).sum() > 0.0 else -X
+    return X, float(np.real(values[0]))
+
+
+def _krylov(L: Map, y: Array) -> Array:
+    """An orthonormal basis of y, L(y), L(L(y)), ..., in columns."""
+    basis = (y / np.linalg.norm(y))[:, None]
+    while basis.shape[1] < len(y):
+        following = L(basis[:, -1])
+        size = np.linalg.norm(following)
+        for _ in range(2):
+            following = following - basis @ (basis.T @ following)
+        if not np.linalg.norm(following) > 1e-9 * size:
+            break
+        basis = np.hstack([basis, (following / np.linalg.norm(following))[:, None]])
+    return basis
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.problem import Problem
+from designer.model.units import natural_units
+from designer.proof.hidden import grows_unseen
 
 _NEARLY_UNSTABLE = 0.999
 _RARELY = 0.05  # an arrival or delivery probability below this is worth a word
@@ -29,6 +31,7 @@ _NEVER_QUITE = 1e-6  # a transition probability below this, too
 _SCALES = 1e6
 _DEPENDENT = 1e-9  # relative to the sizes of A and C: below this, a singular value is 0
 _ONE_BY_ONE = 100  # n nx modes up to which nodes and links are relaxed one by one
+_COMPUTED = "; this is computed, not proved"
 
 
 def warnings(problem: Problem) -> list[str]:
@@ -54,9 +57,12 @@ def refuse_nothing_to_estimate(problem: Problem) -> None:
 def refuse_hopeless(problem: Problem) -> None:
     """Unattainable, before anything is solved, where `obstacles` finds one."""
     found = obstacles(problem)
+    proved = [sentence for sentence in found if not sentence.endswith(_COMPUTED)]
+    found = [*proved, *(sentence for sentence in found if sentence not in proved)]
     if found:
         more = f" (and {len(found) - 1} more of the kind)" if len(found) > 1 else ""
-        raise Unattainable(f"{problem.name} has no solution: {found[0]}{more}")
+        says = "has no solution" if proved else "has no solution, as far as floats tell"
+        raise Unattainable(f"{problem.name} {says}: {found[0]}{more}")
 
 
 def explained(problem: Problem, error: Unattainable, solvable: Callable[[Problem], bool]) -> Unattainable:
@@ -73,25 +79,49 @@ def explained(problem: Problem, error: Unattainable, solvable: Callable[[Problem
 
 # obstacles, by proof
 def obstacles(problem: Problem) -> list[str]:
-    """What rules out every mean-square stable network of filters of this form; empty for a stable plant."""
+    """What rules out every mean-square stable network of filters of this form; empty for a stable plant.
+
+    Floats find each, in natural units; what exact arithmetic proves false is left out, and what it does not prove says
+    that it is computed.
+    """
     found: list[str] = []
     for eigenvalue, V in _growing(problem):
-        sees = [bool(np.abs(node.C @ V).max() > _DEPENDENT * np.abs(node.C).max()) for node in problem.nodes]
+        sees = [bool(np.abs(C @ V).max() > _DEPENDENT * np.abs(C).max()) for C in _scaled(problem)[1]]
         for modes in closed_classes(problem):
             adjacency = np.any([problem.topologies[s].adjacency > 0.0 for s in modes], axis=0)
             upstream = _closure(adjacency)
             for i in range(problem.n):
-                blind = _blind(problem, eigenvalue, np.flatnonzero(upstream[i]))
-                if blind:
-                    found.append(_blind_text(problem, i, eigenvalue, modes, sees))
+                heard = np.flatnonzero(upstream[i])
+                if _blind(problem, eigenvalue, heard):
+                    text = _blind_text(problem, i, eigenvalue, modes, sees)
+                    found += _as_proved(text, problem, [int(j) for j in heard], chance=1.0)
                 else:
                     found += _too_many_losses(problem, i, eigenvalue, sees, upstream[i], adjacency[i])
     return list(dict.fromkeys(found))
 
 
+def _scaled(problem: Problem) -> tuple[Array, list[Array]]:
+    """A and every C in natural units of the states."""
+    units = natural_units(problem).state
+    return problem.plant.A * units / units[:, None], [node.C * units for node in problem.nodes]
+
+
+def _as_proved(text: str, problem: Problem, blind: list[int], *, chance: float) -> list[str]:
+    """The sentence that with this chance in each step nothing shows what grows, as nodes `blind` never show it.
+
+    None where exact arithmetic says otherwise.
+    """
+    C = np.vstack([problem.nodes[j].C for j in blind]) if blind else np.zeros((0, problem.nx))
+    proved = grows_unseen(problem.plant.A, C, chance)
+    return [] if proved is False else [text if proved else text + _COMPUTED]
+
+
 def _growing(problem: Problem) -> list[tuple[complex, Array]]:
-    """Eigenvalues with |lambda| >= 1, one of each conjugate pair, each with a basis of its eigenvectors (nx, k)."""
-    A = problem.plant.A
+    """Eigenvalues with |lambda| >= 1, one of each conjugate pair, each with a basis of its eigenvectors (nx, k).
+
+    In natural units.
+    """
+    A, _ = _scaled(problem)
     found: list[tuple[complex, Array]] = []
     for eigenvalue in np.linalg.eigvals(A):
         known = any(abs(eigenvalue - other) <= 1e-6 * abs(eigenvalue) for other, _ in found)
@@ -119,9 +149,9 @@ def _closure(related: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _blind(problem: Problem, eigenvalue: complex, nodes: NDArray[np.int64]) -> bool:
     """Whether some v with A v = lambda v is in no measurement of these nodes (Popov, Belevitch, Hautus)."""
-    A = problem.plant.A
+    A, C = _scaled(problem)
     rows = [A - eigenvalue * np.eye(len(A))]
-    rows += [problem.nodes[j].C / (np.abs(problem.nodes[j].C).max() or 1.0) for j in nodes]
+    rows += [C[j] / (np.abs(C[j]).max() or 1.0) for j in nodes]
     sizes = np.linalg.svd(np.vstack(rows), compute_uv=False)
     return bool(sizes[-1] <= _DEPENDENT * max(float(np.abs(A).max()), 1.0))
 
@@ -154,27 +184,31 @@ def _too_many_losses(
     eyes = [j for j in range(problem.n) if upstream[j] and sees[j]]
     lost = float(np.prod([1.0 - beta[j] for j in eyes]))
     if lost * factor >= 1.0:
+        blind = [j for j in range(problem.n) if upstream[j] and not sees[j]]
         names = listed(problem.node_names[j] for j in eyes)
         if len(eyes) == 1:
-            return [
+            text = (
                 f"node {names} alone sees the unstable part of the plant ({unstable}), and its measurements arrive "
                 f"with probability {beta[eyes[0]]:g}: {_growth(lost, factor)}; "
                 f"arrival_probability must be above {1.0 - 1.0 / factor:.6g}"
-            ]
-        return [
+            )
+            return _as_proved(text, problem, blind, chance=lost)
+        text = (
             f"the measurements of nodes {names}, which alone see the unstable part of the plant ({unstable}), are all "
             f"lost together with probability {lost:.6g}: {_growth(lost, factor)}; raise their arrival_probability"
-        ]
+        )
+        return _as_proved(text, problem, blind, chance=lost)
     senders = [j for j in range(problem.n) if hears[j] and j != i]
     cut = float(np.prod([1.0 - problem.delivery[i, j] for j in senders])) * (1.0 - beta[i] if sees[i] else 1.0)
     if senders and cut * factor >= 1.0:
         name = problem.node_names[i]
         own = ", as is its own measurement," if sees[i] else ""
-        return [
+        text = (
             f'all messages to node "{name}" (from {listed(problem.node_names[j] for j in senders)}) are lost together'
             f"{own} with probability {cut:.6g}: against the unstable part of the plant ({unstable}), "
             f"{_growth(cut, factor)}; raise their delivery_probability"
-        ]
+        )
+        return _as_proved(text, problem, [] if sees[i] else [i], chance=cut)
     return []
 
 
@@ -259,7 +293,7 @@ def _warned_plant(problem: Problem) -> Iterator[str]:
         if sizes[large] > _SCALES * sizes[small]:
             yield (
                 f"the largest number in {small} is {sizes[small]:.3g}, and in {large} {sizes[large]:.3g}: they differ "
-                f"by more than {_SCALES:.0e}; units in which both are near 1 make the solver more exact"
+                f"by more than {_SCALES:.0e}; is every unit what it should be?"
             )
 
 

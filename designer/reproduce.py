@@ -144,8 +144,8 @@ class Reproduced(NamedTuple):
             if printed < optimum:
                 said.append(
                     f"Example {number}: the printed {printed:g} is {off:.1f} % below the optimum of the convex problem "
-                    f"(42){agree}. So it cannot come from (42) with the printed data; a misprint is likely, which one "
-                    "we do not know."
+                    f"(42){agree}. As far as solvers tell, it cannot come from (42) with the printed data; a misprint "
+                    "is likely, which one we do not know."
                 )
                 found = [value for key in _FOUND if (value := values.get(key)) is not None]
                 if found and min(found) > printed:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from agent.contract.errors import InputError, Unattainable, listed
-from agent.contract.gains import Gains
+from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
@@ -14,12 +15,15 @@ from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
 from designer.model.error_model import error_model, stacked_gains
+from designer.model.units import NaturalUnits
 from designer.proof.certificate import lyapunov_matrix
+from designer.proof.prover import Prover
 from designer.search.descent import Budget, Progress
 from designer.search.effort import BUDGET, default_method
-from designer.search.exact_design import confirmed, design_exact, lower_end
+from designer.search.exact_design import certify, confirmed, design_exact, lower_end
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
+_PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
@@ -46,13 +50,46 @@ def design(
     refuse_hopeless(problem)
     try:
         if method == EXACT:
-            gains = design_exact(problem, budget=Budget(budget), progress=progress, dask=dask)
+            gains = _exact_in_natural_units(problem, Budget(budget), progress, dask)
         else:
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:
         raise explained(problem, error, _solvable) from None
     certificate = gains.certificate.model_copy(update={"floor": floor(problem)})
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
+
+
+def _exact_in_natural_units(
+    problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None, dask: str | None
+) -> Gains:
+    """The same gains whatever the units: a problem in other powers of two of them is the same one, number by number.
+
+    So what is proved of one is proved of the other; of small networks it is proved again.
+    """
+    natural = NaturalUnits(problem)
+    unit, tell = natural.output, progress
+    if progress is not None and unit != 1.0:
+
+        def tell(at: Progress) -> None:
+            progress(at._replace(gamma=unit * at.gamma))
+
+    gains = design_exact(natural.problem, budget=budget, progress=tell, dask=dask, unit=unit)
+    K, H = natural.back(gains.K, gains.H)
+    certificate = _in_units_of(gains.certificate, unit)
+    small = problem.n * problem.nx <= _PROVED_STATES
+    if small and not Prover(problem, K, H).exact(certificate.gamma).holds:  # numbers near the ends of float64
+        certificate = certify(problem, K, H)
+    update = {"problem": problem, "problem_digest": problem.digest(), "K": K, "H": H, "certificate": certificate}
+    return gains.model_copy(update=update)
+
+
+def _in_units_of(certificate: Certificate, unit: float) -> Certificate:
+    """What is claimed of z in units of `unit`, said of z itself."""
+    values: dict[str, Any] = {name: getattr(certificate, name) for name in ("gamma", "lmi_gamma", "floor")}
+    pairs = {name: getattr(certificate, name) for name in ("exact", "lmi_exact")}
+    said = {name: None if value is None else unit * value for name, value in values.items()}
+    said |= {name: None if pair is None else (unit * pair[0], unit * pair[1]) for name, pair in pairs.items()}
+    return certificate.model_copy(update=said)
 
 
 def _with_exact(gains: Gains) -> Gains:

@@ -49,7 +49,7 @@ ROOMS = {
     "designer.workers": "",
     "designer.search": "designer.decay designer.gain designer.lmi designer.model designer.proof designer.workers",
     "designer.problems": "",
-    "designer.diagnosis": "",
+    "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
     "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
@@ -67,7 +67,7 @@ ROOMS = {
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording designer.problems",
-    "designer.commands": "agent.commands agent.contract.recording designer.analysis designer.compare "
+    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis designer.compare "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
     "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
     "designer.simulation designer.synthesis designer.watch designer.what_if",
@@ -131,8 +131,8 @@ LAZY = [
     "designer/__main__.py",
 ]  # fmt: skip
 LIGHT = [
-    "agent.cli", "agent.commands", "agent.plan", "agent.contract.errors", "agent.contract.files", "designer.cli",
-    "designer.commands",
+    "agent.cli", "agent.commands", "agent.plan", "agent.signals", "agent.contract.errors", "agent.contract.files",
+    "designer.cli", "designer.commands",
 ]  # fmt: skip
 
 

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agent.commands.options import Subcommands, add_command
-from agent.contract.errors import EXIT_GOOD, InputError
+from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM
+from designer.commands.stopping import stoppable
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -126,7 +127,8 @@ def design_and_save(
     method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
-    gains = design(problem, method=method, budget=budget, progress=_descent_progress(), dask=dask)
+    with stoppable():
+        gains = design(problem, method=method, budget=budget, progress=_descent_progress(), dask=dask)
     if gains.solver.status.startswith("out of time"):
         print(
             f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
@@ -208,8 +210,8 @@ def _descent_progress() -> Callable[[Progress], None]:
         if progress.seconds >= shown + 2.0:
             shown = progress.seconds
             print(
-                f"{progress.seconds:5.0f} s  from {progress.start}: gamma < {progress.gamma:.6g} "
-                f"after {progress.steps} steps; Ctrl-C keeps the best so far",
+                f"{progress.seconds:5.0f} s  from {progress.start}, {counted(progress.steps, 'change')} on: "
+                f"gamma over {progress.horizon} steps < {progress.gamma:.6g}; Ctrl-C keeps the best so far",
                 file=sys.stderr,
             )
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.decay import Decay, decay
+from designer.decay import Decay, decay, invariants, lasting, scaled
 from designer.gain.products import Collected, Pattern, Products
 from designer.model.error_model import ErrorModel, LinkTerms
 from designer.model.units import natural_scale
@@ -23,7 +23,7 @@ _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
-_STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
+_LASTS = 1e-7  # relative to what grows
 
 
 class Gain(NamedTuple):
@@ -79,6 +79,10 @@ class Operator:
         if self.links is not None:
             self.links.add(S, Y_bar)
         return S
+
+    def of(self, Y: Array) -> Array:
+        """S(Y), (modes, n_eta + nw, n_eta + nw)."""
+        return self.joint(self.bar(Y))
 
     def corner(self, Y: Array) -> Array:
         """L(Y) = A'Y_bar A + sum of alpha_i F_i'Y_bar F_i, the mean of Y one step later, (modes, n_eta, n_eta)."""
@@ -163,18 +167,66 @@ class InvariantSet:
     """All Y <= g P, for a P that satisfies (17): once in it, the recursion at g holds over any horizon.
 
     (17) says that a step leads from g P to no more than g P, with W positive definite; and less Y leads to less, with
-    a larger W.
+    a larger W. Of several P, each has its set.
     """
 
-    def __init__(self, P: Array) -> None:
-        self.P = P  # (modes, n_eta, n_eta)
+    def __init__(self, *P: Array, escape: Escape | None = None) -> None:
+        self.P, self.escape = P, escape  # each (modes, n_eta, n_eta)
 
     def contains(self, Y: Array, g: float) -> bool:
         """Cholesky decides."""
-        try:
-            return bool(np.isfinite(np.linalg.cholesky(g * self.P - Y)).all())
-        except np.linalg.LinAlgError:
-            return False
+        return any(_positive(g * P - Y) for P in self.P)
+
+    def never_reached(self, Y: Array, g: float) -> bool:
+        """Whether it is known that the recursion fails sooner or later."""
+        return self.escape is not None and float(np.vdot(self.escape.X, Y)) > g * self.escape.level
+
+
+def _positive(Y: Array) -> bool:
+    try:
+        return bool(np.isfinite(np.linalg.cholesky(Y)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+class Escape(NamedTuple):
+    """What Y grows along for ever, once tr(XY) > g level: docs/theory.md, section 2.
+
+    A step leads to Y+ >= L_c(Y) - g Gamma'Gamma for any policy w = Gamma eta, L_c of the closed loop. With X that w can
+    bring about, and whose image one step later is lambda X, lambda > 1, tr(XY+) >= lambda tr(XY) - g tr(X Gamma'Gamma).
+    """
+
+    X: Array  # (modes, n_eta, n_eta)
+    level: float  # tr(X Gamma'Gamma) / (lambda - 1)
+
+
+def escape(operator: Operator, P: Array) -> Escape | None:
+    """For the policy that is worst against P, a P that is nearly the largest; None where nothing lasts under it."""
+    n, S = operator.size, operator.of(P)
+    Gamma = np.asarray(np.linalg.solve(operator.eye_w - S[:, n:, n:], S[:, n:, :n]), dtype=np.float64)
+
+    def carry(X: Array) -> Array:
+        return operator.carry(_joint(X, Gamma))
+
+    unit = np.zeros_like(S)
+    unit[:, n:, n:] = operator.eye_w
+    found = lasting(carry, operator.carry(unit))
+    if found is None or not found[1] > 1.0 + _LASTS:
+        return None
+    X, growth = found
+    if np.abs(carry(X) - growth * X).max() > _LASTS * (growth - 1.0) * np.abs(X).max():
+        return None
+    spent = float(np.vdot(X, Gamma.swapaxes(1, 2) @ Gamma))
+    return Escape(X, spent / (growth - 1.0) * (1.0 + _LASTS)) if spent > 0.0 else None
+
+
+def _joint(X: Array, Gamma: Array) -> Array:
+    """E[eta; w][eta; w]' for w = Gamma eta."""
+    GX = Gamma @ X
+    return np.concatenate(
+        [np.concatenate([X, GX.swapaxes(1, 2)], axis=2), np.concatenate([GX, GX @ Gamma.swapaxes(1, 2)], axis=2)],
+        axis=1,
+    )
 
 
 class Trial(NamedTuple):
@@ -200,6 +252,8 @@ def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: In
         if invariant is not None and steps >= next_look:
             if invariant.contains(Y, g):
                 return Trial(True, measure, steps)
+            if invariant.never_reached(Y, g):
+                return Trial(False, -math.inf, steps)
             next_look = steps + 1 + steps // 16
     return Trial(True if invariant is None else None, measure, horizon)
 
@@ -209,12 +263,14 @@ def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
     """The exact gain of an error model, between bounds that differ by `width` of its square where steps suffice."""
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
-    P, decays = lyapunov(operator)
-    if P is None:
+    decays = decay(operator.corner, len(operator.MM), operator.units)
+    P = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
+    if not P:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
-    found = _bracket(operator, _MOST_STEPS, InvariantSet(P), width)
-    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P, decays.radius)
+    invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
+    found = _bracket(operator, _MOST_STEPS, invariant, width)
+    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P[0], decays.radius)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -302,12 +358,4 @@ def lyapunov(operator: Operator) -> tuple[Array | None, Decay]:
     found = decay(operator.corner, len(operator.MM), operator.units)
     if found.total is None or found.rest is None or not found.dies_out:
         return None, found
-    return _scaled(operator, found.total, found.rest), found
-
-
-def _scaled(operator: Operator, P0: Array, V: Array) -> Array:
-    """c P0 with the largest c that (17) allows, but for the factor _STRICT; V = P0 - L(P0)."""
-    S = operator.joint(operator.bar(P0))
-    AB, BB = S[:, : operator.size, operator.size :], S[:, operator.size :, operator.size :]
-    worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
-    return np.asarray(P0 / (worst * _STRICT))
+    return scaled(operator.of, found.total, found.rest), found

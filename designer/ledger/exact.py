@@ -55,7 +55,8 @@ class Ledger:
 
     def __init__(self, problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float, P: Array) -> None:
         self.models, self.gamma, self.k = Models(problem, K_bar, H_bar), gamma, 0
-        self._g, self._set = gamma**2 * (1.0 + 1e-9), InvariantSet(P)  # a rounding above: to hold at it is to be valid
+        self._g, self._P = gamma**2 * (1.0 + 1e-9), P  # a rounding above: to hold at it is to be valid
+        self._set = InvariantSet(P)
         self._root_inverse = np.linalg.inv(np.linalg.cholesky(P))
         self._now = AS_DESIGNED
         self._past: list[_Gone] = []  # the last step first
@@ -80,7 +81,7 @@ class Ledger:
     def anew(self, k: int) -> Ledger:
         """One of the same network that stands at step k, and has been told nothing."""
         models = self.models
-        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._set.P)
+        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._P)
         other.models, other.k = models, k  # the models that were made
         return other
 
@@ -228,7 +229,7 @@ class Ledger:
         if Y is None or (c := self._against_P(Y)) > g:
             return False
         through = [] if self._now.is_as_designed else [self.models.acting(self._now)]
-        return self._ends(self._back(c * self._set.P, g, through), g, last)
+        return self._ends(self._back(c * self._P, g, through), g, last)
 
     def _within(self) -> int | None:
         """The first of the steps to come from which on the gain is below (1 + SHARE) gamma."""
@@ -246,7 +247,7 @@ class Ledger:
         low, high = 1.0, self._c
         while high > 1.2 * low:
             middle = math.sqrt(low * high)
-            low, high = (low, middle) if self._ends(self._set.P, middle) else (middle, high)
+            low, high = (low, middle) if self._ends(self._P, middle) else (middle, high)
         return high
 
     def _against_P(self, Y: Array) -> float:
@@ -259,8 +260,8 @@ class Ledger:
             return before
         operator: Operator = acting.operator if acting else self.models.designed
         if acting is not None and acting.J is not None:
-            before *= max(1.0, self._against_P(acting.before(self._set.P)))
-        S, n = operator.joint(operator.bar(self._set.P)), operator.size
+            before *= max(1.0, self._against_P(acting.before(self._P)))
+        S, n = operator.joint(operator.bar(self._P)), operator.size
         S[:, :n] = self._root_inverse @ S[:, :n]
         S[:, :, :n] = S[:, :, :n] @ self._root_inverse.swapaxes(1, 2)
         scale = np.concatenate([np.full(n, math.sqrt(before)), np.ones(operator.nw)])

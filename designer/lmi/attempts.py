@@ -16,7 +16,6 @@ from designer.lmi import LmiSolution
 
 SOLVED = ("optimal", "optimal_inaccurate")
 INFEASIBLE = ("infeasible", "infeasible_inaccurate")
-_ADVICE = "try the problem in other units, so that its numbers are near 1"
 
 
 class Attempt(NamedTuple):
@@ -44,7 +43,7 @@ def answers(what: str, attempts: Iterable[Attempt]) -> Iterator[LmiSolution]:
     if infeasible and not answered:
         raise Unattainable(f"{what} is infeasible ({'; '.join(history)})")
     if not answered:
-        raise Unattainable(f"no solver answered {what} ({'; '.join(history)}); {_ADVICE}")
+        raise Unattainable(f"no solver answered {what} ({'; '.join(history)})")
 
 
 def first_accurate(found: Iterator[LmiSolution]) -> LmiSolution:

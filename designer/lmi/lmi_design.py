@@ -6,15 +6,19 @@ import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
+
+from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
-from agent.contract.gains import Certificate, Gains, LinkMatrices
+from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.lmi import LmiSolution
 from designer.lmi.attempts import tried_further
 from designer.lmi.back_off import Confirmed, back_off, least_gamma, satisfies_17
 from designer.lmi.inwards import inwards
 from designer.lmi.recovery import block_diagonal, links, unconfirmed
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import error_model, link_gains, stacked_links
+from designer.model.units import natural_units
 from designer.proof.prover import Prover
 
 
@@ -32,7 +36,16 @@ class Designed(NamedTuple):
 
 def design_by_lmi(problem: Problem, method: str) -> Gains:
     started = time.perf_counter()
-    solution, (K, H, confirmed), certify = first_confirmed(problem, method, METHODS[method](problem))
+    try:
+        solution, (K, H, confirmed), certify = first_confirmed(problem, method, METHODS[method](problem))
+        solver, lmi_gamma = solution.solver, solution.gamma
+    except Unattainable as error:
+        designed = ignoring(problem) if method in MOVABLE else None
+        if designed is None:
+            raise
+        (K, H, confirmed), certify, lmi_gamma = designed, 0.0, None
+        why = f"gains that ignore all measurements, because {error}"
+        solver = Solver(name="none", version="-", status=why, iterations=0, seconds=time.perf_counter() - started)
     ended = time.perf_counter()
     return Gains(
         problem=problem,
@@ -40,10 +53,46 @@ def design_by_lmi(problem: Problem, method: str) -> Gains:
         method=method,
         K=K,
         H=H,
-        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
-        solver=solution.solver,
+        certificate=_certificate(problem, confirmed, lmi_gamma=lmi_gamma),
+        solver=solver,
         seconds={"solve": ended - started - certify, "certify": certify, "total": ended - started},
     )
+
+
+def ignoring(problem: Problem) -> Designed | None:
+    """K_ii = A and no measurement: what is left where no answer of a solver is confirmed; None: an unstable plant."""
+    n, modes = problem.n, len(problem.topologies)
+    K, H = link_gains(problem, np.tile(np.kron(np.eye(n), problem.plant.A), (modes, 1, 1)), no_measurements(problem))
+    M = error_model(problem, *stacked_links(problem, K, H)).M
+    p = problem.plant_states
+    for spare in _SPARE if problem.plant.spectral_radius < 1.0 else ():
+        W_inverse = np.asarray(np.linalg.inv(reachable(problem, spare)), dtype=np.float64)
+        Q = np.tile((1.0 - spare) * W_inverse / n, (modes, n, 1, 1))
+        P = block_diagonal(spare * W_inverse[:p, :p], (Q + Q.swapaxes(2, 3)) / 2.0)
+        verdict = Prover(problem, K, H, P=P).theorem1(least_gamma(M, P) * (1.0 + 1e-9))
+        if verdict.holds:
+            return Designed(K, H, Confirmed(P, "structured", 0.0, verdict))
+    return None
+
+
+def reachable(problem: Problem, spare: float) -> Array:
+    """W with W - A W A' a little more than B B': then W^-1 satisfies (17) for x+ = A x + B w, strictly.
+
+    Where gains ignore all measurements, x and every e_i move like that, with the same w. By the convexity of squares a
+    mean of W^-1 over all of them satisfies (17) for them together, and (18) says gamma^2 = n lambda_max(M W M').
+    """
+    A, B = problem.plant.A, problem.plant.B
+    units = natural_units(problem).state
+    W, power = B @ B.T + spare * np.diag(units**2), A
+    for _ in range(_DOUBLINGS):
+        W, power = W + power @ W @ power.T, power @ power
+    return np.asarray((W + W.T) / 2.0)
+
+
+def no_measurements(problem: Problem) -> Array:
+    """H_bar of gains that use none."""
+    rows = sum(len(node.C) for node in problem.nodes)
+    return np.zeros((len(problem.topologies), problem.n * problem.nx, rows))
 
 
 def first_confirmed(
@@ -100,7 +149,7 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
     return None
 
 
-def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float) -> Certificate:
+def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float | None) -> Certificate:
     P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.plant_states
     modes, nodes = problem.mode_names, problem.node_names
     structured = confirmed.form == "structured"
@@ -151,5 +200,7 @@ METHODS: dict[str, Callable[[Problem], Iterator[LmiSolution]]] = {
 # Methods whose gains may be moved a little together with P: their P stays small enough to store for large networks.
 # The others are the paper's, and their gains stay as the solver gave them.
 MOVABLE = frozenset({"decomposed"})
+_SPARE = (1e-6, 1e-4, 1e-2)  # of P, for x and for strictness
+_DOUBLINGS = 60
 _NEAR = 5e-4  # a certified gamma this little above the LMI's, relatively, is taken at once
 STEPS_INWARDS = (0.0, 1e-6, 3e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)

@@ -55,9 +55,7 @@ def links(problem: Problem, solution: LmiSolution) -> tuple[LinkMatrices, LinkMa
 
 
 def unconfirmed(problem: Problem, solution: LmiSolution, why: str | None) -> Unattainable:
-    advice = "; try the problem in other units, so that its numbers are near 1"
     return Unattainable(
         f"{solution.solver.name} says {solution.solver.status} with gamma {solution.gamma:.6g} for {problem.name}, "
         f"but the check without a solver does not confirm its answer ({why})"
-        + (advice if problem.plant.spectral_radius < 1.0 else "")
     )

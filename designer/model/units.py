@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.model.error_model import ErrorModel
 
@@ -58,7 +59,48 @@ def natural_scale(model: ErrorModel) -> Array:
     of_state = reach.reshape(-1, nx).max(axis=0)
     known = (of_state > 0.0) & np.isfinite(of_state)
     of_state = np.where(known, of_state, of_state[known].max(initial=0.0) or 1.0)
-    return np.tile(np.exp2(np.round(-np.log2(of_state) / 2.0)), model.size // nx)
+    return np.tile(1.0 / _power(np.sqrt(of_state)), model.size // nx)
+
+
+class NaturalUnits:
+    """The problem with states, measurements and z in powers of two of their units, in which they are near 1.
+
+    So it is the same problem, number by number, and gains go to and fro without rounding: whatever is found in these
+    units does not depend, by a single bit, on the powers of two that somebody measures in.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.state = _power(natural_units(problem).state)
+        self.y = [
+            _power(np.hypot(np.linalg.norm(node.C * self.state, axis=1), np.linalg.norm(node.D, axis=1)))
+            for node in problem.nodes
+        ]
+        self.output = float(_power(np.array(np.linalg.norm(problem.plant.M * self.state, 2))))
+        scaled = rescaled(problem, Units(self.state, self.output))
+        nodes = [
+            node.model_copy(update={"C": node.C / y[:, None], "D": node.D / y[:, None]})
+            for node, y in zip(scaled.nodes, self.y, strict=True)
+        ]
+        self.names, self.problem = problem.node_names, scaled.model_copy(update={"nodes": tuple(nodes)})
+
+    def back(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
+        """Gains of `problem`, in the units of the problem that was given."""
+        rows, y = self.state[:, None], dict(zip(self.names, self.y, strict=True))
+        x = dict.fromkeys(self.names, self.state)
+        return _divided(K, rows, x), _divided(H, rows, y)
+
+
+def _divided(gains: LinkMatrices, rows: Array, by: dict[str, Array]) -> LinkMatrices:
+    """Every matrix times `rows`, and over what the node that it hears measures in."""
+    return {
+        mode: {i: {j: G * rows / by[j] for j, G in heard.items()} for i, heard in of_mode.items()}
+        for mode, of_mode in gains.items()
+    }
+
+
+def _power(sizes: Array) -> Array:
+    """The powers of two that are not above; exactly, so that twice as much has twice the power."""
+    return np.asarray(np.ldexp(1.0, np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1] - 1))
 
 
 def rescaled(problem: Problem, units: Units) -> Problem:

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from agent.contract.arrays import Array
-from designer.decay import Decay, decay
+from designer.decay import Decay, decay, invariants
 from designer.proof.ball_model import BallModel
 from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 
 Indices = NDArray[np.int64]
 
 _STEPS_OF_REACH = 8
-_STRICT = 1.0 + 1e-3  # P stands this factor below the largest multiple that satisfies (17)
 
 
 class Enclosed(NamedTuple):
@@ -94,20 +93,11 @@ class FloatModel:
         """Of L, and what solves Z - L(Z) > 0, found and not proved."""
         return decay(lambda Y: self.weigh(Y)[:, : self.size, : self.size], self.modes, weights(self._reach()))
 
+    @cached_property
     @np.errstate(all="ignore")
-    def lyapunov(self) -> Array | None:
-        """P(s) for (17), (modes, n_eta, n_eta), found and not proved; None where the errors do not decay.
-
-        With P0 > 0 and V = P0 - L(P0) > 0, the largest c P0, but for a factor: by Schur's complement
-        I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B).
-        """
-        P0, V, n = self.decay.total, self.decay.rest, self.size
-        if P0 is None or V is None or not self.decay.dies_out:
-            return None
-        S = self.weigh(P0)
-        AB, BB = S[:, :n, n:], S[:, n:, n:]
-        worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(V, AB)).max())
-        return P0 / (worst * _STRICT) if worst > 0.0 else P0
+    def invariants(self) -> list[Array]:
+        """Every P(s) for (17), (modes, n_eta, n_eta), found and not proved; none where the errors do not decay."""
+        return invariants(self.weigh, self.decay, weights(self._reach()), np.tile(self.peak.middle, (self.modes, 1, 1)))
 
     def _reach(self) -> Array:
         """About the square of what w of energy 1 makes of each state of the plant, and of its errors, (n_eta,)."""

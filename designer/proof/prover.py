@@ -27,7 +27,8 @@ BALLS: tuple[Make, ...] = tuple(partial(ByBalls, bits=bits) for bits in (128, 25
 _LARGEST_RECURSION = 130
 _LARGEST_INEQUALITY = 450
 _STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
-_STEPS_OF_LOWER_END = 20_000
+MOST_STEPS_BELOW = 20_000
+_STEPS_OF_OTHERS = 5000  # with a P that is to end it early
 
 
 class _Answer(NamedTuple):
@@ -60,11 +61,17 @@ class Prover:
     ) -> None:
         self._problem, self._K, self._H, self._given, self._makes = problem, K, H, P, makes
         self._made: list[Arithmetic] = []
+        self._known: dict[int, list[_Answer]] = {}  # by a P of `_invariants`, which stays
 
-    @cached_property
+    @property
     def P(self) -> Array | None:
         """What satisfies (17), as far as is known before it is proved; None where floats find none."""
-        return self._floats.model.lyapunov() if self._given is None else self._given
+        return next(iter(self._invariants), None)
+
+    @cached_property
+    def _invariants(self) -> list[Array]:
+        """P, and others that end the recursion earlier where errors decay slowly."""
+        return self._floats.model.invariants if self._given is None else [self._given]
 
     @cached_property
     def _floats(self) -> ByFloats:
@@ -82,15 +89,26 @@ class Prover:
         """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
         if self.P is None:
             return self._no_P(gamma)
-        P, modes, answers = self.P, self._problem.mode_names, self._stability
-        if all(proved(answer.findings) for answer in answers):
-            last = self._ask(lambda by: recursion(by, modes, gamma, P, most=most), largest=_LARGEST_RECURSION)
-            return _verdict(gamma, [*answers, last])
-        if any(refuted(answer.findings) for answer in answers):
+        for P in reversed(self._invariants[1:]):
+            answers = self._recursion(P, gamma, most=min(most, _STEPS_OF_OTHERS))
+            if all(proved(answer.findings) or refuted(answer.findings) for answer in answers) and len(answers) > 2:
+                return _verdict(gamma, answers)
+        answers = self._recursion(self.P, gamma, most=most)
+        if len(answers) > 2 or any(refuted(answer.findings) for answer in answers):
             return _verdict(gamma, answers)
         return _verdict(gamma, [*self._disproof(gamma), *answers])
 
-    def at_least(self, gamma: float, *, most: int = _STEPS_OF_LOWER_END) -> str | None:
+    def _recursion(self, P: Array, gamma: float, *, most: int) -> list[_Answer]:
+        """(17), P > 0, and where both are proved the recursion with this P."""
+        modes, answers = self._problem.mode_names, self._stability_by(P)
+        if not all(proved(answer.findings) for answer in answers):
+            return answers
+        return [
+            *answers,
+            self._ask(lambda by: recursion(by, modes, gamma, P, most=most), largest=_LARGEST_RECURSION),
+        ]
+
+    def at_least(self, gamma: float, *, most: int = MOST_STEPS_BELOW) -> str | None:
         """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps."""
         for k in range(len(self._makes)):
             by = self._arithmetic(k)
@@ -116,19 +134,26 @@ class Prover:
             return Stability(None, arithmetic)
         return Stability(proved(signs.findings) or (False if refuted(signs.findings) else None), arithmetic)
 
-    @cached_property
+    @property
     def _inequality_17(self) -> _Answer:
-        P, modes = self.P, self._problem.mode_names
-        assert P is not None
-        answer = self._ask(lambda by: found("(17)", modes, by.inequality_17(P)), largest=_LARGEST_INEQUALITY)
-        return self._of_P(answer)
+        return self._stability[0]
 
-    @cached_property
+    @property
     def _stability(self) -> list[_Answer]:
-        P, modes = self.P, self._problem.mode_names
-        assert P is not None
+        assert self.P is not None
+        return self._stability_by(self.P)
+
+    def _stability_by(self, P: Array) -> list[_Answer]:
+        """(17) and P > 0."""
+        if id(P) not in self._known:
+            self._known[id(P)] = self._asked_of(P)
+        return self._known[id(P)]
+
+    def _asked_of(self, P: Array) -> list[_Answer]:
+        modes = self._problem.mode_names
+        answer = self._ask(lambda by: found("(17)", modes, by.inequality_17(P)), largest=_LARGEST_INEQUALITY)
         positive = self._ask(lambda by: found("P > 0", modes, by.positive(P)), largest=_LARGEST_INEQUALITY)
-        return [self._inequality_17, self._of_P(positive)]
+        return [self._of_P(answer), self._of_P(positive)]
 
     def _of_P(self, answer: _Answer) -> _Answer:
         """That a P which nobody claims is none says nothing of the claim."""

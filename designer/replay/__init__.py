@@ -23,7 +23,9 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from agent.contract.errors import counted
 from agent.contract.problem import Problem
 from designer.ledger.account import Account
 from designer.ledger.deviation import Deviation
@@ -103,7 +105,8 @@ def replay(
 def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, report: Report | None = None) -> Verdict:
     """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
     central = Central.of(log.gains)
-    tally = Tally(tolerance(log.gains.problem, paced=log.is_paced), log.gains.problem.node_names, trace, part)
+    names = log.gains.problem.node_names
+    tally = Tally(tolerance(log.gains.problem, paced=log.is_paced), names, trace, part, log.grown)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
         compared = _compare(log, central, tally, report or (lambda what, done, of: None))
     return _verdict(log, tally, compared)
@@ -128,7 +131,12 @@ class Tally:
     """The worst gap of each proof, and the first divergence: by step, then in the order of the checks."""
 
     def __init__(
-        self, tolerance: float, node_names: tuple[str, ...], trace: Trace | None = None, part: Part | None = None
+        self,
+        tolerance: float,
+        node_names: tuple[str, ...],
+        trace: Trace | None = None,
+        part: Part | None = None,
+        last: int | None = None,
     ) -> None:
         self.tolerance, self.trace, self._names, self.part = tolerance, trace, node_names, part or Part()
         self.compared = dict.fromkeys((1, 2, 3), 0)
@@ -136,6 +144,8 @@ class Tally:
         self.worst: Divergence | None = None
         self.first: Divergence | None = None
         self.later: Counter[str] = Counter()  # numbers and names beyond the tolerance, by kind, with the first
+        self.leeway = np.nan  # what the tolerance is, in units of the estimates, at the last step of which it is known
+        self.last = last  # that is compared
 
     def add(self, checks: Iterable[Check]) -> None:
         for check in map(self._in_part, checks):
@@ -146,6 +156,9 @@ class Tally:
                 self.trace.add(check)
             gap = np.where(known, check.gap, -1.0)
             self.compared[check.proof] += int(known.sum())
+            if check.proof == 2 and check.field == "x_hat" and check.magnitude is not None:
+                row = int(np.flatnonzero(known.any(axis=1))[-1])
+                self.leeway = self.tolerance * float(check.magnitude[row][known[row]].max())
             self.gaps[check.proof] = max(self.gaps[check.proof], float(gap.max()))
             if self.worst is None or gap.max() > self.worst.gap:
                 row, column = divmod(int(gap.argmax()), gap.shape[1])
@@ -163,10 +176,12 @@ class Tally:
 
     def _in_part(self, check: Check) -> Check:
         """Without what is not to be judged."""
-        if self.part == Part():
+        if self.part == Part() and self.last is None:
             return check
         steps = check.first + np.arange(len(check.gap))
         judged = ((steps >= self.part.first) & (steps <= self.part.last))[:, None]
+        if self.last is not None:
+            judged &= (steps <= self.last)[:, None]
         if self.part.node is not None:
             judged = judged & (check.owner == self._names.index(self.part.node))
         return check._replace(gap=np.where(judged, check.gap, np.nan))
@@ -180,12 +195,17 @@ class PathAudit:
         self.holds, self.compared = True, 0
         self.margin, self.step = np.inf, -1  # the smallest, and where
         self.is_equality_at_1 = False  # so that step 1 says nothing, and is not in the margin
+        self.silent, self.silent_from = 0, -1  # steps whose rounding may be more than the bound, and the first of them
+        self.spoke_again = False  # after that one
 
     def add(self, path: free_run.Path, tolerance: float) -> None:
         steps = path.first + np.arange(len(path.error))
-        known = ~np.isnan(path.error) & ~np.isnan(path.bound) & (steps >= self._part.first) & (steps <= self._part.last)
-        allowed = path.bound + tolerance * path.rounding
-        within = path.error <= allowed
+        judged = ~np.isnan(path.error) & (steps >= self._part.first) & (steps <= self._part.last)
+        rounding = tolerance * path.rounding
+        speaks = (rounding <= path.bound) | (path.bound == 0.0)
+        self._fall_silent(steps[judged], speaks[judged])
+        known = judged & speaks & ~np.isnan(path.bound)
+        within = path.error <= path.bound + rounding
         self.compared += int(known.sum())
         self.holds &= bool(within[known].all())
         counts = known & (path.bound > 0.0)
@@ -193,12 +213,23 @@ class PathAudit:
         self.is_equality_at_1 |= bool(trivial.any())
         counts &= ~trivial
         if counts.any():
-            margins = 1.0 - path.error[counts] / allowed[counts]  # the rounding of a state that grows may be all of it
+            margins = 1.0 - path.error[counts] / path.bound[counts]
             if margins.min() < self.margin:
                 self.margin, self.step = float(margins.min()), int(steps[counts][margins.argmin()])
 
+    def _fall_silent(self, steps: NDArray[np.int64], speaks: NDArray[np.bool_]) -> None:
+        if not self.silent and not speaks.all():
+            self.silent_from = int(steps[~speaks][0])
+        self.silent += int((~speaks).sum())
+        self.spoke_again |= bool(self.silent and speaks[steps > self.silent_from].any())
+
     def note(self) -> str:
         smallest = f"smallest margin {self.margin:.1%}, at step {self.step}"
+        if self.silent:
+            from_where = f"from step {self.silent_from} on"
+            which = f"of {counted(self.silent, 'step')} {from_where}" if self.spoke_again else from_where
+            why = f"it says nothing {which}, where rounding may be more than the bound"
+            return f"{smallest}; {why}" if self.step >= 0 else why
         if self.is_equality_at_1:
             why = "at step 1 the bound is an equality, because w is one number"
             return f"{smallest}; {why}" if self.step >= 0 else why
@@ -306,6 +337,8 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         ledger=promise(log, gamma, compared.faults),
         pacing=compared.pacing,
         path_margin=audit.margin if audit and audit.step >= 0 else None,
+        leeway=None if np.isnan(tally.leeway) else tally.leeway,
+        up_to=tally.last,
     )
 
 

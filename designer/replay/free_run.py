@@ -49,7 +49,8 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
     """eta(k+1) = script A_k eta(k) + script B_k w(k) from eta(0) = 0, with two covariances beside it.
 
     Path gain: X(k+1) = A_k X(k) A_k' + B_k B_k' from X(0) = 0 gives
-    gamma_path(k)^2 = lambda_max(M X(k) M').
+    gamma_path(k)^2 = lambda_max(M X(k) M'). It is carried as a factor, X = S S' with S(k+1) = [A_k S(k), B_k], so that
+    what cancels in M costs no more digits of M S than of z_tilde itself.
 
     Rounding: where each step errs by d_j with |d_j| <= t m_j entry by entry, the free run is off by
     sum_j Phi(k, j+1) d_j after k steps. With Y(k+1) = A_k Y(k) A_k' + diag(m_k)^2 the inequality of Cauchy and
@@ -63,7 +64,8 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
         AB = realised(model, s, np.frombuffer(theta), delivered)
         return Realised(AB[:, :size], AB[:, size:], _delivered_gains(central, s, delivered))
 
-    x, eta, covariances, diagonal = np.zeros(len(plant.A)), np.zeros(size), np.zeros((2, size, size)), np.arange(size)
+    x, eta, Y, diagonal = np.zeros(len(plant.A)), np.zeros(size), np.zeros((size, size)), np.arange(size)
+    S = np.zeros((size, 0))
     for first in range(0, log.steps, block):
         steps = range(first, min(first + block, log.steps))
         keys = [(int(inputs.mode[k]), inputs.theta[k].tobytes(), inputs.phi[k].tobytes()) for k in steps]
@@ -78,12 +80,20 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
         outputs = np.empty((len(steps), len(model.M), len(model.M)))
         for row in range(len(steps)):
             A_k, B_k, _ = transition(*keys[row])
-            outputs[row] = model.M @ covariances[0] @ model.M.T
-            reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
-            covariances = A_k @ covariances @ A_k.T
-            covariances[0] += B_k @ B_k.T
-            covariances[1, diagonal, diagonal] += squares[row]
+            F = model.M @ S
+            outputs[row] = F @ F.T
+            reach[row] = Y[diagonal, diagonal] * ((first + row) * size)
+            S = _short(np.hstack([A_k @ S, B_k]))
+            Y = A_k @ Y @ A_k.T
+            Y[diagonal, diagonal] += squares[row]
         yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), largest(outputs))
+
+
+def _short(S: Array) -> Array:
+    """A factor of the same S S' with fewer columns, once there are many more than rows."""
+    if S.shape[1] <= 2 * S.shape[0] or not np.isfinite(S).all():
+        return S
+    return np.asarray(np.linalg.qr(S.T, mode="r")).T
 
 
 def _delivered_gains(central: Central, s: int, delivered: Flags | None) -> Array:

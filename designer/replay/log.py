@@ -27,7 +27,7 @@ from agent.contract.recording.reader import Progress, RecordingReader
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.part import Part
 from designer.replay.said import Said, excused
-from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
+from designer.replay.topics import GROWN, Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
 _MEMORY = 2.0  # seconds, and two steps, after which a node has said why it substituted something
 _NAMED = 3  # so many damages and topics are named
@@ -72,6 +72,7 @@ class Log:
     origin: Numbers  # (steps, n): Estimate.origin, by `Senders.origin`; -1 where a node goes on
     said: Said  # what its events say of messages that were not there in time
     period: float  # seconds, of a paced run; 0 in lock-step
+    grown: int | None  # the last step that is compared, because later ones may have numbers beyond the ceiling
 
     @property
     def is_paced(self) -> bool:
@@ -130,7 +131,8 @@ def _log(
     end, damages = reader.end or {}, reader.damages
     problem, topics, columns = reader.gains.problem, content.topics, content.columns
     unreadable = content.unreadable()
-    strange = [*content.faults(), *reader.faults]
+    grown = content.grown()
+    strange = [*content.faults(), *content.beyond(grown), *reader.faults]
     if unreadable.total and (damages or reader.is_unchecked):
         first = unreadable.first[0]
         damages.append(f"{counted(unreadable.total, 'message')} cannot be read, the first of them on {first}")
@@ -177,6 +179,7 @@ def _log(
         senders=content.senders,
         said=content.said,
         period=content.period,
+        grown=grown,
         **_arrays(columns, topics, problem.node_names, steps),
     )
 
@@ -286,6 +289,26 @@ class _Content:
     def last(self) -> int:
         """The last step of which there is anything, -1 where there is nothing."""
         return max(topic.last for topic in self.topics.values())
+
+    def grown(self) -> int | None:
+        """The first step whose states or estimates have grown so far that later ones may be beyond the ceiling."""
+        large = np.zeros(len(self.columns["has"]), dtype=bool)
+        for topic in self.topics.values():
+            for name, place in topic.places.items():
+                if name in ("x", "x_hat"):
+                    has = self.columns["has"][:, topic.place]
+                    large[has] |= (np.abs(self.columns[name][has, place]) > GROWN).any(axis=1)
+        return int(np.argmax(large)) if large.any() else None
+
+    def beyond(self, grown: int | None) -> list[str]:
+        """Numbers beyond the ceiling that no growth up to the step before explains; their messages are none."""
+        found = []
+        for topic in self.topics.values():
+            for step, what in topic.beyond:
+                if grown is None or step <= grown:
+                    self.columns["has"][step, topic.place] = False
+                    found.append((step, what))
+        return [what for _, what in sorted(found)]
 
     def faults(self) -> list[str]:
         """Messages that can be read, and cannot be of this run."""

@@ -36,6 +36,7 @@ class Check(NamedTuple):
     logged: Array  # (steps, columns); positions in `words` where there are any
     expected: Array
     words: Sequence[str] = ()
+    magnitude: Array | None = None  # (steps, columns), of numbers
 
     def divergence(self, row: int, column: int, node_names: Sequence[str]) -> Divergence:
         """One of its numbers, or names, beside what it should be."""
@@ -58,7 +59,7 @@ def numbers(
     proof: int, field: str, first: int, owner: Numbers, logged: Array, expected: Array, magnitude: Array
 ) -> Check:
     gap = np.abs(logged - expected) / np.maximum(magnitude, FLOOR)
-    return Check(proof, field, first, owner, gap, logged, expected)
+    return Check(proof, field, first, owner, gap, logged, expected, magnitude=magnitude)
 
 
 def names(field: str, first: int, owner: Numbers, logged: Numbers, expected: Numbers, words: Sequence[str]) -> Check:

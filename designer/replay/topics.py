@@ -24,6 +24,7 @@ from agent.contract.recording import Logged
 Numbers = NDArray[np.int64]
 
 CEILING = 1e140  # squares of larger numbers overflow in the proofs
+GROWN = 1e130  # of a state that has grown so far, the next may be beyond it
 NAMED = 20  # so many faults of a kind are named, the others counted
 _ROWS = 1 << 20  # of the columns at first, where the run has so many steps
 _STAMP = ("number", "time")  # columns that are not of a message's content
@@ -151,6 +152,7 @@ class Topic:
         self.copies = 0  # messages that stand there again, equal in content
         self.double: set[int] = set()  # steps of which there is another message, of other content
         self.faults = Sentences()  # messages that cannot be of this run
+        self.beyond: list[tuple[int, str]] = []  # steps and numbers beyond the ceiling
         self.unreadable = Sentences()  # messages that are none at all
         self.places, self.words, self._may_be_empty = places, words, may_be_empty
         self._decode = model.__pydantic_validator__.validate_json  # what Message.decode calls
@@ -226,8 +228,8 @@ class Topic:
         if not self._steps:
             return
         values = np.array(self._values).reshape(len(self._steps), -1)
-        within = self._within(values)
-        steps = np.array(self._steps)[within]
+        self._blank(values)
+        steps = np.array(self._steps)
         self.last = max(self.last, int(steps.max(initial=-1)))
         columns.reach(self.last + 1)
         has = columns["has"][:, self.place]
@@ -236,7 +238,7 @@ class Topic:
             first = np.zeros(len(steps), dtype=bool)
             first[np.unique(steps, return_index=True)[1]] = True
             fresh &= first
-        rows = {name: (column, batch[within]) for name, (column, batch) in self._rows(columns, values)}
+        rows = {name: (column, batch) for name, (column, batch) in self._rows(columns, values)}
         for column, batch in rows.values():
             column[steps[fresh]] = batch[fresh]
         has[steps[fresh]] = True
@@ -244,15 +246,15 @@ class Topic:
             self._again(int(at), int(steps[at]), rows)
         self._clear()
 
-    def _within(self, values: Array) -> NDArray[np.bool_]:
-        """Which of the messages that wait hold no number beyond the ceiling; the others are faults."""
+    def _blank(self, values: Array) -> None:
+        """Forget the numbers of the messages that wait and hold one beyond the ceiling; and note them."""
         beyond = np.abs(values) > CEILING
         names = np.repeat(list(self.places), self._widths)
         for row in np.flatnonzero(beyond.any(axis=1)):
             column = int(np.argmax(beyond[row]))
             what = f"{names[column]} holds {values[row, column]}, beyond {CEILING:g}"
-            self.faults.add(f"{self.topic}, step {self._steps[row]}: {what}")
-        return np.asarray(~beyond.any(axis=1))
+            self.beyond.append((self._steps[row], f"{self.topic}, step {self._steps[row]}: {what}"))
+            values[row] = np.nan
 
     def _rows(self, columns: Columns, values: Array) -> Iterator[tuple[str, tuple[NDArray[Any], NDArray[Any]]]]:
         """The columns of this topic, and what waits to be written there."""

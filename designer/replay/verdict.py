@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -152,7 +153,9 @@ class Verdict:
     gamma: Gamma
     pacing: Pacing | None  # of a paced run
     ledger: Account | None  # what gamma says of this run; None where it is not proved
-    path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound that is not trivial; bound: proof 5 and its rounding
+    path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound of proof 5 that is not trivial
+    leeway: float | None  # the tolerance in units of the estimates, at the last step
+    up_to: int | None  # the last step that was compared, where later ones have numbers too large for that
 
     @property
     def agrees(self) -> bool:
@@ -206,6 +209,8 @@ class Verdict:
             "worst_gap": self.worst_gap,
             "worst": self.worst.document() if self.worst else None,
             "tolerance": self.tolerance,
+            "leeway": self.leeway,
+            "up_to": self.up_to,
             "first_divergence": first.document() if first else None,
             "later_divergences": dict(self.later),
             "missing": self.missing.total,
@@ -249,7 +254,11 @@ class Verdict:
             return f"{answer}: " + ("it holds nothing to compare" if self.agrees else "its bytes were changed later")
         if self.outcome == "diverges" and all(proof.holds is not False for proof in self.proofs if proof.number != 4):
             return f"{answer}: every number in it agrees, but {self._what_is_wrong()}"
-        return answer
+        return (
+            answer
+            if self.up_to is None
+            else f"{answer} up to step {self.up_to}: later numbers are too large to compare"
+        )
 
     def _what_is_wrong(self) -> str:
         """The faults of proof 4 in a few words."""
@@ -270,6 +279,8 @@ class Verdict:
             f'run "{self.run}", seed {self.seed}, {self.steps} of {self.planned} steps, '
             f"{counted(self.messages, 'message')}, {self.status}{f': {self.reason}' if self.reason else ''}",
         ]
+        if self.leeway is not None and math.isfinite(self.leeway):
+            lines.append(f"at its last step an estimate may be off by {self.leeway:.2g} and agree, by rounding alone")
         if self.part != Part():
             lines.append(f"judged: {self.part.text()}")
         if self.damage:

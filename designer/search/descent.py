@@ -54,6 +54,7 @@ class Progress(NamedTuple):
     steps: int
     gamma: float
     seconds: float
+    horizon: int  # T; the exact gain is that of all steps
 
 
 class Candidate(NamedTuple):
@@ -252,7 +253,7 @@ class _Search:
                 self.best = x
             if self.progress is not None:
                 gamma = math.exp(x[-1] / 2.0)
-                self.progress(Progress(self.start, mu, self.steps, gamma, self.budget.spent))
+                self.progress(Progress(self.start, mu, self.steps, gamma, self.budget.spent, self.barrier.horizon))
 
         # L-BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
         inverse_hessian = self.barrier.inverse_hessian(x, mu)

@@ -20,6 +20,7 @@ MOST_NODES = 200  # that are searched at once; larger networks are searched in w
 BUDGET = 600.0  # seconds
 LONG = 60.0  # worth a word beforehand
 _GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
+_STEPS, _LEFT = 20, 2.0
 _MORE = 2.65  # times as many of large networks
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
@@ -47,7 +48,13 @@ def seconds_of_exact(problem: Problem) -> float:
 
 def gradients_of_exact(problem: Problem) -> float:
     """Estimated number of gradients over 20 steps; one over 40 counts twice."""
-    return _GRADIENTS * min(math.pow(max(problem.n / 6.0, 1.0), 1.4), _MORE)
+    return _GRADIENTS * min(math.pow(max(problem.n / 6.0, 1.0), 1.4), _MORE) * _longer(problem)
+
+
+def _longer(problem: Problem) -> float:
+    """How many times 20 steps the horizon has to be, because what the plant holds decays slowly: e^-2 of it is left."""
+    decay = 1.0 - min(problem.plant.spectral_radius, 1.0) ** 2 if problem.carries_plant else 1.0
+    return min(max(_LEFT / (_STEPS * decay), 1.0), longest_horizon(problem) / _STEPS) if decay else 1.0
 
 
 def whole_fits(problem: Problem, *, free: float | None = None) -> bool:

@@ -18,10 +18,10 @@ from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.prover import BALLS, FLOATS, Prover
+from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
 from designer.search.descent import Budget, Descent, Progress, descend
 from designer.search.effort import in_windows, refuse_without_memory, whole_fits
-from designer.search.starts import WEIGHT, consensus_gains, least_variance_gains
+from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
 from designer.search.windows import WEIGHT as WEIGHT_OF_WINDOWS
 from designer.search.windows import window_gains
 from designer.workers import greet_cluster
@@ -30,6 +30,8 @@ _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
+_BELOW_WHERE_SLOW = (1e-6, 1e-3, 1e-1, 0.5)  # a W fails after many steps, if not far below
+_SLOW = 0.98  # radius
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -42,11 +44,13 @@ def design_exact(
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
+    unit: float = 1.0,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
     `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
     when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
+    `unit`: of z; it counts in the status alone.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
@@ -57,8 +61,14 @@ def design_exact(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
             "the plant that the disturbance drives; measure it"
         )
-    own = starts is None
-    starts, lmi_gamma = _starts(problem) if starts is None else (starts, None)
+    own, lmi_gamma = starts is None, None
+    if starts is None:
+        try:
+            starts, lmi_gamma = _starts(problem)
+        except KeyboardInterrupt:
+            if problem.plant.spectral_radius >= 1.0:
+                raise
+            own, starts, budget = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0)
     lmi_exact = next(
         (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
     )
@@ -93,7 +103,7 @@ def design_exact(
         solver=Solver(
             name="barrier descent, numpy",
             version=np.__version__,
-            status=_status(descent),
+            status=_status(descent, unit),
             iterations=descent.steps,
             seconds=solved - begun,
         ),
@@ -159,7 +169,7 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | 
     if not verdict.holds:
         raise Unattainable(
             f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
-            f"({verdict.failure}); try the problem in other units, so that its numbers are near 1"
+            f"({verdict.failure})"
         )
     return Certificate(
         gamma=verdict.gamma,
@@ -180,9 +190,10 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     """
     if problem.n * problem.nx > _PROVED_STATES:
         return gain.low * (1.0 - _BELOW[3])
-    prover = Prover(problem, K, H)
-    tried = (gain.low * (1.0 - part) for part in _BELOW)
-    return next((low for low in tried if low > 0.0 and prover.at_least(low, most=2 * gain.horizon + 10)), 0.0)
+    prover, slow = Prover(problem, K, H), gain.radius > _SLOW
+    most = MOST_STEPS_BELOW if slow else 2 * gain.horizon + 10
+    tried = (gain.low * (1.0 - part) for part in (_BELOW_WHERE_SLOW if slow else _BELOW))
+    return next((low for low in tried if low > 0.0 and prover.at_least(low, most=most)), 0.0)
 
 
 def _advice(problem: Problem) -> str:
@@ -209,11 +220,11 @@ def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *
     return verdict
 
 
-def _status(descent: Descent) -> str:
+def _status(descent: Descent, unit: float) -> str:
     """How the search ended and where it began, and what the chosen gains trade for their size and decay."""
     chosen, least = descent.chosen, descent.least
     return (
         f"{descent.ended}; from {descent.start or 'the start'}; "
-        f"least {least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
-        f"chosen {chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
+        f"least {unit * least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
+        f"chosen {unit * chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
     )

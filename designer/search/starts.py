@@ -98,6 +98,13 @@ def _plant_covariance(problem: Problem) -> Array:
     return np.asarray(X)
 
 
+def ignoring(problem: Problem) -> StackedGains:
+    """K_ii = A and nothing else: no loss touches these, and they are stable where the plant is."""
+    modes, rows = len(problem.topologies), rows_total(problem)
+    K_bar = np.tile(np.kron(np.eye(problem.n), problem.plant.A), (modes, 1, 1))
+    return np.asarray(K_bar), np.zeros((modes, problem.n * problem.nx, rows))
+
+
 def least_variance_gains(problem: Problem) -> StackedGains:
     """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
     modes, entries, pattern = len(problem.topologies), Entries(problem), Inputs(problem).pattern

@@ -15,6 +15,7 @@ from agent.contract.problem import Problem
 from designer.cli import main
 from designer.diagnosis import closed_classes, explained, obstacles, warnings
 from designer.problems import find
+from designer.proof.hidden import grows_unseen
 from designer.synthesis import design
 
 
@@ -262,8 +263,8 @@ def test_scales_that_differ_are_said() -> None:
 
     problem = changed(network(), change)
     assert warnings(problem) == [
-        'the largest number in B is 1e-05, and in C of node "2" 20: they differ by more than 1e+06; units in which '
-        "both are near 1 make the solver more exact"
+        'the largest number in B is 1e-05, and in C of node "2" 20: they differ by more than 1e+06; is every unit '
+        "what it should be?"
     ]
 
 
@@ -303,3 +304,51 @@ def test_the_command_warns_on_stderr_and_in_json(tmp_path: Path, capsys: pytest.
     said = 'node "1": arrival_probability 0.01 is below 0.05; its measurements hardly count'
     assert f"warning: {said}" in printed.err
     assert json.loads(printed.out)["warnings"] == [said]
+
+
+def pendulum(rate: float, C: list[list[float]], **changes: object) -> Problem:
+    """An inverted pendulum whose angle is measured, its rate in units of 1 / `rate` rad/s."""
+    document = {
+        "name": "pendulum",
+        "unbiased": True,
+        "plant": {"A": [[1.0, 0.02 / rate], [0.2 * rate, 1.0]], "B": [[0.0], [0.1 * rate]], "M": [[1.0, 0.0]]},
+        "node": [{"name": "a", "C": C, "D": [[0.05]], "arrival_probability": 0.9, "loss": "seen"}],
+        "topology": [{"name": "t", "hears": {}}],
+        "markov": {"transition": [[1.0]], "initial": "t"},
+    }
+    return Problem.from_document(document | changes)
+
+
+@pytest.mark.parametrize("rate", [1.0, 1e5, 1e-6, 2.0**30])
+def test_units_make_nobody_blind(rate: float) -> None:
+    assert obstacles(pendulum(rate, [[1.0, 0.0]])) == []
+    sees_nothing = obstacles(pendulum(rate, [[0.0, 0.0]]))
+    assert len(sees_nothing) == 1
+    assert not sees_nothing[0].endswith("computed, not proved")
+
+
+def test_a_sensor_that_shows_what_grows_a_little_is_no_obstacle() -> None:
+    """Floats take an entry of 1e-12 for nothing; exact arithmetic does not."""
+    plant = {"A": [[1.2, 0.0], [0.0, 0.5]], "B": [[1.0], [1.0]], "M": [[1.0, 1.0]]}
+    assert obstacles(pendulum(1.0, [[1e-12, 1.0]], plant=plant)) == []
+    assert len(obstacles(pendulum(1.0, [[0.0, 1.0]], plant=plant))) == 1
+
+
+@pytest.mark.parametrize(
+    ("A", "C", "chance", "grows"),
+    [
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 1.0, True),
+        ([[1.2, 0.0], [0.0, 0.5]], [[1.0, 0.0]], 1.0, False),
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 0.69, False),  # 1.44 x 0.69 < 1
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 0.7, True),
+        ([[1.2, 0.0], [0.0, 0.5]], [[1e-300, 1.0]], 1.0, False),
+        ([[1.0, 1.0], [0.0, 1.0]], [[0.0, 0.0]], 1.0, True),  # a double integrator, on the border
+        ([[0.0, 1.0], [-1.0, 0.0]], [[0.0, 0.0]], 1.0, True),  # and a rotation
+        ([[0.0, 1.5], [-1.5, 0.0]], [[0.0, 0.0]], 1.0, True),
+        ([[1.2, 0.0], [0.0, 0.5]], [], 0.5, False),
+    ],
+)
+def test_what_grows_unseen_is_decided_exactly(
+    A: list[list[float]], C: list[list[float]], chance: float, grows: bool
+) -> None:
+    assert grows_unseen(np.array(A), np.array(C).reshape(-1, 2), chance) is grows

@@ -25,6 +25,22 @@ from designer.search.effort import (
 from designer.synthesis import design
 
 
+def test_slow_plants_are_known_to_take_longer() -> None:
+    """As many times as long as the horizon that their search comes to."""
+    quick = find("zhu2020-lossy")
+
+    def with_radius(radius: float) -> Problem:
+        document = quick.document()
+        A = np.array(document["plant"]["A"])
+        document["plant"]["A"] = (A * radius / quick.plant.spectral_radius).tolist()
+        return Problem.from_document(document)
+
+    estimates = [seconds_of_exact(with_radius(radius)) for radius in (0.5, 0.99, 0.999, 0.9999)]
+    assert estimates[0] == seconds_of_exact(quick)
+    assert 3.0 < estimates[1] / estimates[0] < 10.0
+    assert 10.0 < estimates[2] / estimates[0] <= estimates[3] / estimates[0] <= 32.0
+
+
 def test_the_distances() -> None:
     """Of the exact gain, below Theorem 2's bound and above the floor."""
     ladder = Ladder(floor=2.0, exact=(2.19, 2.2), gamma=2.2, theorem2_exact=(3.0, 3.1), theorem2=4.0)

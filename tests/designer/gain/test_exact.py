@@ -12,6 +12,7 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from designer.decay import invariants
 from designer.gain import exact
 from designer.gain.exact import InvariantSet, Operator, exact_gain, horizon_gain, recursion_holds, step
 from designer.gain.floor import floor
@@ -583,3 +584,50 @@ def test_what_grows_unseen_does_not_matter_where_a_measurement_shows_all_of_w() 
         "node": [{"name": "only", "C": [[0.0]], "D": [[1.0]], "arrival_probability": 1.0}],
     }
     assert floor(Problem.from_document(document)) == 0.0
+
+
+def slow(a: float) -> Case:
+    """One node that hardly listens to a leaking integrator, losses hidden: E|error|^2 decays by a^2 in each step."""
+    problem = Problem.from_document(
+        {
+            "name": "slow",
+            "plant": {"A": [[a, 0.1], [0.0, 0.5]], "B": [[0.1, 0.0], [0.3, 0.0]], "M": [[1.0, 0.2]]},
+            "node": [{"name": "a", "C": [[1.0, 0.0]], "D": [[0.0, 0.5]], "arrival_probability": 0.6}],
+            "topology": [{"name": "t", "hears": {}}],
+            "markov": {"transition": [[1.0]], "initial": "t"},
+        }
+    )
+    return problem, problem.plant.A[None], np.array([[[0.1], [0.05]]])
+
+
+def test_a_slow_system_has_the_gain_of_the_whole_recursion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither what ends it early nor what tells at once that it will fail changes the answer."""
+    model = error_model(*slow(0.99))
+    quick = exact_gain(model)
+    monkeypatch.setattr(exact, "invariants", lambda *given: invariants(*given)[:1])
+    whole = exact_gain(model)
+    assert quick.horizon < whole.horizon / 5
+    assert max(quick.low, whole.low) <= min(quick.high, whole.high)
+    assert quick.high <= quick.low * (1.0 + 1e-5)
+    assert whole.high <= whole.low * (1.0 + 1e-5)
+
+
+@pytest.mark.parametrize("a", [0.999, 0.99999])
+def test_the_gain_of_a_slow_system_takes_few_steps_and_is_proved(a: float) -> None:
+    """However slowly it decays; and gamma is proved by floats or balls, and its lower end as far as steps go."""
+    problem, K_bar, H_bar = slow(a)
+    gain = exact_gain(error_model(problem, K_bar, H_bar))
+    assert gain.high <= gain.low * (1.0 + 1e-5)
+    assert gain.horizon < 1000
+    K, H = link_gains(problem, K_bar, H_bar)
+    assert Prover(problem, K, H).exact(gain.high * (1.0 + 1e-5), most=5000).holds
+
+
+def test_errors_that_ignore_everything_have_the_gain_of_the_gramian() -> None:
+    """x and its estimate's error are one: what is slow in other directions never moves."""
+    problem, _, H_bar = slow(0.99999)
+    A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
+    gramian = np.linalg.solve(np.eye(4) - np.kron(A, A), (B @ B.T).reshape(-1)).reshape(2, 2)
+    gain = exact_gain(error_model(problem, A[None], 0.0 * H_bar))
+    assert gain.high == pytest.approx(float(np.sqrt(M @ gramian @ M.T).item()), rel=1e-4)
+    assert gain.low <= float(np.sqrt(M @ gramian @ M.T).item()) * (1.0 + 1e-9)

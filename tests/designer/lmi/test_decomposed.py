@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -17,7 +17,7 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains, Solver
 from agent.contract.problem import Problem
 from benchmarks.design import banded
-from designer.lmi import cliques, conic, decomposed, theorem2
+from designer.lmi import LmiSolution, cliques, conic, decomposed, lmi_design, theorem2
 from designer.lmi.back_off import back_off, least_gamma
 from designer.lmi.cones import Assembly
 from designer.lmi.inwards import inwards
@@ -483,3 +483,24 @@ def test_twenty_five_nodes_are_designed_in_seconds_and_stored_small() -> None:
     assert len(gains.canonical()) < 200_000
     assert gains.solver.status == "optimal"
     assert gains.solver.version == clarabel.__version__
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_where_no_answer_is_confirmed_there_are_gains_that_ignore_all_measurements(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their gamma is that of the gramian of the plant, as if no node had a sensor; and no hint at units."""
+
+    def fails(problem: Problem) -> Iterator[LmiSolution]:
+        raise Unattainable("no solver answered")
+
+    problem = random_problem(seed)
+    monkeypatch.setitem(lmi_design.METHODS, "decomposed", fails)
+    gains = lmi_design.design_by_lmi(problem, "decomposed")
+    A, B, M = problem.plant.A, problem.plant.B, problem.plant.M
+    size = len(A)
+    W = np.linalg.solve(np.eye(size**2) - np.kron(A, A), (B @ B.T).reshape(-1)).reshape(size, size)
+    trivial = float(np.sqrt(problem.n * np.linalg.eigvalsh(M @ W @ M.T)[-1]))
+    assert trivial < gains.certificate.gamma < trivial * (1.0 + 1e-4)
+    assert "ignore all measurements, because no solver answered" in gains.solver.status
+    assert verify(gains).holds

@@ -273,7 +273,7 @@ def test_P_satisfies_17_and_hardly_more_of_it_does(variant: dict[str, Any]) -> N
     """By the other error model, in floats."""
     problem = real_network(random_problem(3), **variant)
     gains = consensus_gains(problem, weight=0.2)
-    P = ByFloats(problem, *link_gains(problem, *gains)).model.lyapunov()
+    P = ByFloats(problem, *link_gains(problem, *gains)).model.invariants[0]
     assert P is not None
     for factor, holds in ((1.0, True), (1.01, False)):
         least = np.linalg.eigvalsh(inequality_17(error_model(problem, *gains), factor * P)).min()
@@ -292,9 +292,9 @@ def test_P_does_not_depend_on_units() -> None:
     for node, said in zip(problem.nodes, document["node"], strict=True):
         said["C"] = (node.C / units).tolist()
     other = Problem.from_document(document)
-    found = ByFloats(problem, *link_gains(problem, K_bar, H_bar)).model.lyapunov()
+    found = ByFloats(problem, *link_gains(problem, K_bar, H_bar)).model.invariants[0]
     K, H = link_gains(other, K_bar * every_e[:, None] / every_e, H_bar * every_e[:, None])
-    in_units, every_eta = ByFloats(other, K, H).model.lyapunov(), np.tile(units, problem.n + 1)
+    in_units, every_eta = ByFloats(other, K, H).model.invariants[0], np.tile(units, problem.n + 1)
     assert found is not None
     assert in_units is not None
     np.testing.assert_allclose(in_units * every_eta * every_eta[:, None], found, rtol=1e-12)
@@ -309,4 +309,4 @@ def test_errors_that_grow_have_no_P() -> None:
     K_bar += 1.5 * np.eye(K_bar.shape[1])
     assert not exact_gain(error_model(problem, K_bar, H_bar)).stable
     with ctx.workprec(128):
-        assert FloatModel(BallModel(problem, *link_gains(problem, K_bar, H_bar))).lyapunov() is None
+        assert FloatModel(BallModel(problem, *link_gains(problem, K_bar, H_bar))).invariants == []

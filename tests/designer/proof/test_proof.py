@@ -25,8 +25,8 @@ from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.decay import decay
-from designer.gain.exact import Operator, _scaled, exact_gain, horizon_gain
+from designer.decay import decay, scaled
+from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
@@ -67,7 +67,7 @@ def tight_P(model: ErrorModel) -> Array:
     found = decay(operator.corner, model.modes, np.ones(model.size))
     assert found.total is not None
     assert found.rest is not None
-    return _scaled(operator, found.total, found.rest)
+    return scaled(operator.of, found.total, found.rest)
 
 
 def certified(problem: Problem, kind: Kind) -> Gains:
