@@ -121,8 +121,7 @@ class Scene:
         self._no_book = unproved or ""
         if unproved is None:
             self._book = Book(gains, start, self._asked)
-        for name in gains.problem.node_names:
-            self._node(name)
+        self._nodes = {name: self._node(name) for name in gains.problem.node_names}
 
     def present(self, there: Iterable[str]) -> None:
         """Who takes part just now."""
@@ -132,6 +131,9 @@ class Scene:
 
     def hear(self, topic: str, message: Message, at: float) -> None:
         """A message that arrived at `at`."""
+        if not self._is_of_the_run(topic, message):
+            self.unreadable += 1
+            return
         self._messages += 1
         match message:
             case Mode():
@@ -148,6 +150,15 @@ class Scene:
                 self._hear_account(who.partition("-")[2], message)
             case Event():
                 self._hear_event(message)
+
+    def _is_of_the_run(self, topic: str, message: Message) -> bool:
+        """As far as its facts are known: of one of its nodes, and its steps."""
+        if self.gains is None or self._start is None:
+            return True
+        names, (kind, _, rest) = self.gains.problem.node_names, topic.partition("/")
+        node = rest.partition("/")[0] if kind == "node" else ""
+        node = message.who.removeprefix(node_who("")) if isinstance(message, Account) else node
+        return message.step < self._start.steps and (not node or node in names)
 
     def settle(self, now: float, enough: Callable[[], bool] = lambda: False) -> None:
         """To be called now and then: note how fast the run is, and bring the ledger up to date, until `enough`."""
@@ -188,7 +199,7 @@ class Scene:
             reasons=dict(sorted(self._reasons.items())),
             gone=sorted(self._gone),
             ended=self.ended,
-            nodes=[self._nodes[name] for name in self._in_order()],
+            nodes=list(self._nodes.values()) if self.gains else [self._nodes[name] for name in sorted(self._nodes)],
             ledger=self._ledger(),
             events=list(self._events),
         )
@@ -272,11 +283,6 @@ class Scene:
     def _tell(self, step: int, kind: str, text: str) -> None:
         self._events.append(Told(self._told, step, kind, text))
         self._told += 1
-
-    def _in_order(self) -> list[str]:
-        """The names of the nodes, as the problem has them where that is known."""
-        known = self.gains.problem.node_names if self.gains is not None else ()
-        return [*known, *sorted(self._nodes.keys() - set(known))]
 
     def _node(self, name: str) -> NodeSeen:
         if name not in self._nodes:

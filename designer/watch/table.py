@@ -14,6 +14,7 @@ from designer.watch.scene import NodeSeen, Seen
 
 SHOWN = 8  # events that a terminal shows
 AROUND = 10  # lines of a terminal for what is neither a node nor an event
+NAMED = 6  # nodes that were heard are named up to so many
 BEHIND = 2  # steps by which a node may be behind the clock
 COLOURS = {"valid": "green", "valid plus": "yellow", "void": "bold red", "none": "yellow"}
 ALARMS = {"late", "silent", "gone", "began", "fault", "stop", "stood", "unrecorded"}  # kinds of events
@@ -107,7 +108,8 @@ def _step(node: NodeSeen, seen: Seen) -> Text:
 
 
 def _heard(node: NodeSeen, seen: Seen) -> Text:
-    heard = Text(" ".join(node.heard) or ("" if node.step is None else "nobody"))
+    few = len(node.heard) <= NAMED
+    heard = Text((" ".join(node.heard) if few else f"{len(node.heard)} nodes") if node.step is not None else "")
     return heard.append(f" not {' '.join(node.not_heard)}" if node.not_heard else "", style="red")
 
 

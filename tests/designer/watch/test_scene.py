@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,29 @@ def test_what_was_not_heard_is_named(faulty: list[Sent]) -> None:
                 assert node.not_heard == [name for name in hears if name not in document["heard"]]
 
 
+@pytest.mark.parametrize(
+    ("topic", "change"),
+    [
+        ("node/5/estimate", {}),
+        ("node/2/estimate", {"step": STEPS}),
+        ("mode", {"step": 2**40}),
+        ("account", {"who": "node-5"}),
+    ],
+)
+def test_what_is_not_of_the_run_is_not_believed(faulty: list[Sent], topic: str, change: dict[str, Any]) -> None:
+    """No node is there that the problem does not have, and no step beyond the last; so what is kept is bounded."""
+    like = next(sent for sent in faulty if sent.topic == topic.replace("5", "1"))
+    scene = heard(faulty[:200])
+    before = scene.seen().document()
+    heard([like._replace(topic=topic, document=like.document | change)], facts=False, scene=scene)
+    after = scene.seen().document()
+    assert after["unreadable"] == 1
+    rates = {"unreadable", "steps_per_second", "messages_per_second"}
+    assert {key: value for key, value in after.items() if key not in rates} == {
+        key: value for key, value in before.items() if key not in rates
+    }
+
+
 def test_rates_are_over_the_last_seconds() -> None:
     scene = heard(PacedRun(GAINS, steps=STEPS, seed=SEED).messages)
     seen = scene.seen()
@@ -213,6 +237,23 @@ def test_the_table_has_it_all(faulty: list[Sent]) -> None:
     assert "ledger at step 6: valid" in text
     assert "gone: node-1" in text
     assert "node 1" not in rows["2"]
+
+
+def test_of_many_that_were_heard_there_is_the_number(faulty: list[Sent]) -> None:
+    seen = heard(faulty[:200]).seen()
+    seen.nodes[0].heard, seen.nodes[0].not_heard = [f"n{i}" for i in range(10)], ["n11"]
+    assert "10 nodes not n11" in drawn(seen)
+
+
+def test_of_more_nodes_than_a_terminal_has_lines_those_in_trouble_come_first(faulty: list[Sent]) -> None:
+    seen = heard(faulty[:20]).seen()
+    seen.nodes = [replace(seen.nodes[1], name=f"n{i}", there=i != 70) for i in range(80)]
+    console = Console(width=120, height=40, record=True, file=io.StringIO(), force_terminal=True)
+    console.print(table(seen))
+    text = console.export_text()
+    rows = [line.split()[0] for line in text.splitlines() if line.startswith("n") and line[1].isdigit()]
+    assert rows == ["n70", *(f"n{i}" for i in range(21))]
+    assert "and 58 more" in text
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
