@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from subprocess import Popen
 
-from runs import line_with, started
+from runs import PATIENCE, line_with, started
 
 from agent.contract.gains import Gains
 
@@ -19,7 +19,7 @@ class Roles:
     ) -> None:
         """`plan` are options of the coordinator, `run` is the name."""
         self._stack, self.gains, self.recording, self.run = stack, gains, recording, run
-        words = ["coordinator", gains, "--listen", "tcp/127.0.0.1:0", "--run", run, *plan]
+        words = ["coordinator", gains, "--listen", "tcp/127.0.0.1:0", "--run", run, "--wait", PATIENCE, *plan]
         self.coordinator = stack.enter_context(started(*words))
         self.address = line_with(self.coordinator, "listening at").split()[-1]
 
@@ -33,6 +33,5 @@ class Roles:
         return self._role("node", "--node", name)
 
     def _role(self, role: str, *words: object) -> Popen[str]:
-        return self._stack.enter_context(
-            started(role, self.gains, *words, "--run", self.run, "--connect", self.address)
-        )
+        common = "--run", self.run, "--connect", self.address, "--wait", PATIENCE
+        return self._stack.enter_context(started(role, self.gains, *words, *common))

@@ -17,7 +17,7 @@ import pytest
 from here import here
 from places import GOLDEN
 from roles import Roles
-from runs import MANY, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
+from runs import MANY, PATIENCE, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
 
 from agent.contract.errors import Interrupted
 from agent.contract.gains import Gains
@@ -46,6 +46,11 @@ def run(tmp_path: Path) -> Iterator[Roles]:
         yield roles
 
 
+def watch_of(run: Roles) -> tuple[object, ...]:
+    """The command that watches it."""
+    return "watch", "--connect", run.address, "--wait", PATIENCE
+
+
 def until(process: Popen[str], holds: Callable[[State], bool]) -> Iterator[State]:
     """The states that are printed, up to the first of which it holds."""
     assert process.stdout is not None
@@ -54,7 +59,7 @@ def until(process: Popen[str], holds: Callable[[State], bool]) -> Iterator[State
         yield state
         if holds(state):
             return
-    raise AssertionError("it ended before")
+    raise AssertionError(f"it ended before: {process.communicate()[1]}")
 
 
 def is_complete(state: State) -> bool:
@@ -67,7 +72,7 @@ def node(state: State, name: str) -> State:
 
 
 def test_it_watches_a_run_from_the_middle_and_leaves_without_harm(run: Roles, tmp_path: Path) -> None:
-    words = "watch", "--connect", run.address
+    words = watch_of(run)
     with started(*words, "--json") as watch, started(*words) as log:
         states = list(until(watch, is_complete))
         run.nodes[1].kill()
@@ -75,17 +80,17 @@ def test_it_watches_a_run_from_the_middle_and_leaves_without_harm(run: Roles, tm
         last = node(states[-1], "2")["step"]
         run.node("2")
         states += until(watch, lambda state: node(state, "2")["there"] and node(state, "2")["step"] > last)
-        once = answer(peakmesh("watch", GAINS, "--connect", run.address, "--once", "--json"))
+        once = answer(peakmesh(*words, GAINS, "--once", "--json"))
         assert (once["run"], once["ended"]) == ("shown", None)
         other = tmp_path / "other.json"
         document = Gains.load(GAINS).document()
         document["solver"]["seconds"] += 1.0
         Gains.from_document(document).save(other)
-        refused = peakmesh("watch", other, "--connect", run.address)
+        refused = peakmesh(*words, other)
         assert refused.returncode == 2
         assert 'run "shown" has other gains' in refused.stderr
         watch.send_signal(signal.SIGINT)
-        assert watch.wait(60) == 130
+        assert watch.wait(PATIENCE) == 130
         watched_to_its_end(run, log)
     assert replay(run.recording).agrees
     what_was_shown_is_what_was_recorded(run.recording, [*states, once])
@@ -96,12 +101,12 @@ def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
     close_a_terminal_on(run)
     assert run.coordinator.poll() is None
     run.coordinator.send_signal(signal.SIGINT)
-    assert run.coordinator.wait(60) == 130
-    said, complaints = log.communicate(timeout=60)
+    assert run.coordinator.wait(PATIENCE) == 130
+    said, complaints = log.communicate(timeout=PATIENCE)
     assert (log.returncode, complaints) == (0, "")
     assert all(line.startswith(("step ", "  step ")) for line in said.splitlines())
     assert "0 of 4 nodes" in said.splitlines()[-1]
-    run.recorder.wait(60)
+    run.recorder.wait(PATIENCE)
     end = end_of(run.recording)
     assert end is not None
     assert {value for name, value in end.items() if name.startswith("missing.")} == {"0"}
@@ -112,7 +117,7 @@ def close_a_terminal_on(run: Roles) -> None:
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ |= {"TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
-        os.execv(program()[0], program("watch", "--connect", run.address))
+        os.execv(program()[0], program(*watch_of(run)))
     shown = b""
     while b"innovation" not in shown:
         shown += os.read(terminal, 4096)
@@ -151,7 +156,7 @@ def test_of_a_run_on_one_machine_everybody_is_seen(tmp_path: Path) -> None:
         addresses.extend(word.get("listening", []))
 
     def look() -> None:
-        with started("watch", "--connect", addresses[0], "--json") as watch:
+        with started("watch", "--connect", addresses[0], "--wait", PATIENCE, "--json") as watch:
             states.extend(until(watch, is_complete))
         os.kill(os.getpid(), signal.SIGINT)
 
