@@ -7,12 +7,13 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from agent.commands.looking import add_looker, look_on
 from agent.commands.options import Subcommands, load_gains
+from agent.commands.variables import heed_variables
 from agent.contract.errors import EXIT_GOOD, InputError, Interrupted, RunBroken
 
 if TYPE_CHECKING:
@@ -28,11 +29,12 @@ NICE = 10  # on the machine of a run it is the one to wait
 Show = Callable[["Seen"], None]
 
 
-def add_watch(commands: Subcommands) -> None:
-    """Describe `watch` to the parser."""
+def add_watch(commands: Subcommands, environment: Mapping[str, str] = os.environ) -> None:
+    """Describe `watch` to the parser; what its options are by default may stand in the environment."""
     watch = add_looker(commands, "watch", watch_command, "show a running network in the terminal; it takes no part")
     watch.add_argument("--once", action="store_true", help="print one state, and leave")
     watch.add_argument("--json", action="store_true", help="print a JSON object each second, or one with --once")
+    heed_variables(watch, environment)
 
 
 def watch_command(options: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import pty
@@ -25,7 +26,7 @@ from agent.contract.messages import Estimate, PlantState
 from agent.network.arrivals import Arrival
 from agent.network.words import Sample
 from agent.plan import Pace
-from designer.commands.watch import _take_in
+from designer.commands.watch import _take_in, add_watch
 from designer.replay import replay
 from designer.watch.scene import Scene
 
@@ -105,7 +106,7 @@ def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
     said, complaints = log.communicate(timeout=PATIENCE)
     assert (log.returncode, complaints) == (0, "")
     assert all(line.startswith(("step ", "  step ")) for line in said.splitlines())
-    assert "0 of 4 nodes" in said.splitlines()[-1]
+    assert "of 4 nodes" in said.splitlines()[-1]
     run.recorder.wait(PATIENCE)
     end = end_of(run.recording)
     assert end is not None
@@ -196,6 +197,14 @@ def test_a_signal_that_comes_while_a_message_is_read_is_heeded(monkeypatch: pyte
     monkeypatch.setattr("agent.contract.keys.decode", signalled)
     with pytest.raises(Interrupted):
         _take_in(Silent("mode", b"{}"), Scene("a-run"), 0.0, "")  # type: ignore[arg-type]
+
+
+def test_its_options_may_stand_in_the_environment() -> None:
+    parser = argparse.ArgumentParser()
+    variables = {"PEAKMESH_RUN": "hall-7", "PEAKMESH_CONNECT": "tcp/a:1 tcp/b:2", "PEAKMESH_ONCE": "1"}
+    add_watch(parser.add_subparsers(), variables)
+    options = parser.parse_args(["watch", "--run", "hall-8"])
+    assert (options.run, options.connect, options.once) == ("hall-8", ["tcp/a:1", "tcp/b:2"], True)
 
 
 @pytest.mark.parametrize("words", [["--run", "a/b"], ["--connect", "7447"], []])
