@@ -26,7 +26,7 @@ LEDGER_SECONDS = 0.1  # of a frame for the ledger; the rest waits
 ONCE_SECONDS = 10.0  # after which --once tells what it knows
 NICE = 10  # on the machine of a run it is the one to wait
 
-Show = Callable[["Seen"], None]
+Show = Callable[["Seen", bool], None]  # the second: whether it is the last
 
 
 def add_watch(commands: Subcommands, environment: Mapping[str, str] = os.environ) -> None:
@@ -62,7 +62,7 @@ def _watch(onlooker: Onlooker, scene: Scene, show: Show, *, once: bool, wait: fl
         over = scene.is_over()
         is_all = over or (once and (scene.is_complete or now >= began + ONCE_SECONDS))
         if is_all or not once:
-            show(scene.seen())
+            show(scene.seen(), is_all)
         if is_all:
             return
         seen_last = now if COORDINATOR in onlooker.present else seen_last
@@ -114,7 +114,7 @@ def _learn(onlooker: Onlooker, scene: Scene, digest: str) -> None:
 def _showing(options: argparse.Namespace) -> Iterator[Show]:
     """What takes a state and shows it: a terminal's screen, lines, or JSON."""
     if options.json or not sys.stdout.isatty() or options.once:
-        yield _print_json(options.once) if options.json else _print_lines(options.once)
+        yield _print_json() if options.json else _print_lines(options.once)
         return
     from rich.console import Console
     from rich.live import Live
@@ -122,16 +122,16 @@ def _showing(options: argparse.Namespace) -> Iterator[Show]:
     from designer.watch.table import table
 
     with Live(console=Console(), auto_refresh=False, vertical_overflow="crop") as live:
-        yield lambda seen: live.update(table(seen), refresh=True)
+        yield lambda seen, is_all: live.update(table(seen), refresh=True)
 
 
-def _print_json(once: bool) -> Show:
+def _print_json() -> Show:
     """One object, or one a second, each with the events since the one before."""
     last, due = -1, 0.0
 
-    def show(seen: Seen) -> None:
+    def show(seen: Seen, is_all: bool) -> None:
         nonlocal last, due
-        if once or seen.ended is not None or time.monotonic() >= due:
+        if is_all or time.monotonic() >= due:
             due = time.monotonic() + LINE_SECONDS
             document = seen.document()
             document["events"] = [told for told in document["events"] if told["number"] > last]
@@ -149,11 +149,11 @@ def _print_lines(once: bool) -> Show:
 
     last, due = -1, 0.0
 
-    def show(seen: Seen) -> None:
+    def show(seen: Seen, is_all: bool) -> None:
         nonlocal last, due
         if once:
             Console(width=None if sys.stdout.isatty() else 120).print(table(seen))
-        elif seen.ended is not None or time.monotonic() >= due:
+        elif is_all or time.monotonic() >= due:
             due = time.monotonic() + LINE_SECONDS
             print("\n".join(lines(seen, after=last)), flush=True)
             last = max([last, *(told.number for told in seen.events)])

@@ -27,6 +27,7 @@ from designer.ledger.promise import Promise
 LAG = 2  # steps by which a mode must be ahead: what is on its way of somebody who is gone has come by then
 PATIENCE = 2.0  # seconds after which a node that says nothing counts as absent, though it has not gone
 BACKLOG = 500  # steps that wait to be settled, at most: of a large network one with a fault may take seconds
+MOST = 2048  # steps of which anything is kept: more than a run may be ahead of its slowest node
 LOOKS = 4  # promises that are worked out each time, at most, where faults begin and end
 
 
@@ -92,6 +93,7 @@ class Book:
     def settle(self, there: Collection[str], enough: Callable[[], bool] = lambda: False) -> None:
         """Settle what can be, until `enough`; `there` are the names of the nodes that take part just now."""
         waited_for = [i for name, i in self._names.items() if name in there]
+        self._catch_up(waited_for)
         if self._next < 0 and not self._may_begin(waited_for):
             return
         looks, settled = LOOKS, False
@@ -105,15 +107,24 @@ class Book:
                 self._look()
         if settled:
             self._look()
-        self._catch_up(waited_for)
 
     def _catch_up(self, waited_for: list[int]) -> None:
-        """Where too many steps wait, leave them out, and begin anew after them."""
+        """Where too many steps wait, leave them out, and begin anew after them.
+
+        They wait where settling them takes too long, or where somebody who is there cannot be heard here.
+        """
+        has_begun = self._next >= 0
         last = min([self._tick - LAG, *(self._newest[i] - 1 for i in waited_for)])
-        if last - self._next > BACKLOG:
-            self._lose()
-            self._next = last
-            self._drop(last)
+        if has_begun and last - self._next > BACKLOG:
+            self._skip_to(last)
+        elif self._tick - (self._next if has_begun else self._first) > MOST:
+            self._first = self._tick
+            self._skip_to(self._tick if has_begun else -1)
+
+    def _skip_to(self, k: int) -> None:
+        self._lose()
+        self._next = k
+        self._drop(max(k, self._first))
 
     # when
     def _may_begin(self, waited_for: list[int]) -> bool:

@@ -249,7 +249,27 @@ def test_what_it_is_too_slow_for_is_left_out(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(module, "BACKLOG", 20)
     book = full()
     book.settle(NAMES, iter([False] * 5 + [True]).__next__)
+    assert book.at == 4
+    book.settle(NAMES, lambda: True)
     assert book.promise is None
     assert max(len(told) for told in book._told) <= LAG + 1
     book.settle(NAMES)
     assert book.since == book.at == STEPS - 1 - LAG
+
+
+@pytest.mark.parametrize("heard_until", [0, 15], ids=["never", "no more"])
+def test_what_waits_for_somebody_who_cannot_be_heard_is_bounded(
+    monkeypatch: pytest.MonkeyPatch, heard_until: int
+) -> None:
+    """In lock-step nobody may be taken to be absent who is there."""
+    monkeypatch.setattr(module, "MOST", 20)
+    book = Book(GAINS, facts(period=0.0), Asked(GAINS.problem, seed=SEED))
+    for sent in PacedRun(GAINS, steps=STEPS, seed=SEED).messages:
+        message = read(sent)
+        if isinstance(message, Mode):
+            book.mode(message.step, message.mode)
+        elif isinstance(message, Estimate) and (sent.topic != "node/4/estimate" or message.step < heard_until):
+            book.estimate(sent.topic.split("/")[1], message)
+        book.settle(NAMES)
+        assert max(map(len, [book._modes, *book._told])) <= 20 + LAG
+    assert book.promise is None
