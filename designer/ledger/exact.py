@@ -127,6 +127,11 @@ class Ledger:
         self._debts = [debt for debt in self._debts if self._size(debt.X) > _FORGOTTEN * debt.most]
 
     # what it says
+    @property
+    def is_void(self) -> bool:
+        """For good: not where the gain is too large just now."""
+        return self._void is not None
+
     def gain(self) -> float:
         """The least gain to z_tilde now that the recursion proves, gamma at least."""
         return math.sqrt(self._least()) if self._is_marked else self.gamma

@@ -151,7 +151,7 @@ class Book:
     @property
     def _is_void(self) -> bool:
         """For good."""
-        return self.promise is not None and self.promise.factor == math.inf
+        return self._ledger is not None and self._ledger.is_void
 
     def _lose(self) -> None:
         """What happened in a step was not heard here; a bound that is void stays so."""
@@ -221,7 +221,7 @@ class Book:
             self._ledger.void(f'the chain never goes from mode "{self._before}" to "{mode}"')
 
     def _look(self) -> None:
-        if self._ledger is None or self._is_void:
+        if self._ledger is None:
             return
         before, self.promise, self.at = self.promise, self._ledger.promise(), self._ledger.k
         if before is None or (before.status, before.reason) != (self.promise.status, self.promise.reason):

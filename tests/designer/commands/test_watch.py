@@ -104,7 +104,7 @@ def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
     run.coordinator.send_signal(signal.SIGINT)
     assert run.coordinator.wait(PATIENCE) == 130
     said, complaints = log.communicate(timeout=PATIENCE)
-    assert (log.returncode, complaints) == (0, "")
+    assert (log.returncode, complaints) == (0, ""), said[-500:]
     assert all(line.startswith(("step ", "  step ")) for line in said.splitlines())
     assert "of 4 nodes" in said.splitlines()[-1]
     run.recorder.wait(PATIENCE)

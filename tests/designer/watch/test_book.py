@@ -273,3 +273,13 @@ def test_what_waits_for_somebody_who_cannot_be_heard_is_bounded(
         book.settle(NAMES)
         assert max(map(len, [book._modes, *book._told])) <= 20 + LAG
     assert book.promise is None
+
+
+def test_a_gain_that_is_too_large_just_now_is_not_void_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what no model describes is."""
+    messages = PacedRun(GAINS, steps=STEPS, seed=SEED, **RUNS["the plant away"]).messages
+    largest = max(promise.factor for promise in told(messages)[1].values())
+    monkeypatch.setattr("designer.ledger.exact.VOID_ABOVE", 1.0 + 0.5 * (largest - 1.0))
+    _, said = told(messages)
+    assert "void" in {promise.status for promise in said.values()}
+    assert said[STEPS - 1 - LAG].status == "valid"
