@@ -37,7 +37,6 @@ class Member(NamedTuple):
     who: str
     process: Process
     is_twin: bool
-    begun: list[float]  # when it began, if it did
 
     @property
     def sentence(self) -> str:
@@ -80,6 +79,8 @@ def place_of(message: Sent | Logged) -> tuple[str, int, bytes]:
 
 
 class World:
+    """Runs a scenario once; `let_go` when its outcome has been looked at."""
+
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         self.scenario, self.recording = scenario, folder / "run.mcap"
         self.machine = Machine(scenario.seed)
@@ -90,7 +91,7 @@ class World:
         self.summary: coordinator.Summary | None = None
         self.words: list[dict[str, Any]] = []
         self._revived: dict[str, list[float]] = {}
-        self._buses: dict[str, Bus] = {}
+        self._pending_revival = 0
         self._survives = scenario.plan.pace is not None
         self._started = False
         self._troubles = list(scenario.troubles)
@@ -121,13 +122,11 @@ class World:
     def _all_over(self) -> bool:
         return all(member.process.is_over for member in self.members) and not self._pending_revival
 
-    _pending_revival = 0
-
     # processes
     def _start(self, who: str, *, twin: bool = False) -> None:
         number = sum(member.who == who for member in self.members)
         process = Process(self.machine, who, number)
-        member = Member(who, process, twin, [])
+        member = Member(who, process, twin)
         self.members.append(member)
         process.on_end.append(partial(self._ended, member))
         process.start(partial(self._main, member))
@@ -143,7 +142,6 @@ class World:
         network = Network(connect=() if who == COORDINATOR else ("tcp/simulated",), wait=scenario.wait, lease=LEASE)
         door: Any = partial(Door, self.net, self.published)
         with Bus(network, run=RUN, who=who, session=door, signals=keep) as bus:
-            self._buses[member.process.name] = bus
             if who == COORDINATOR:
                 summary = coordinator.run(bus, gains, scenario.plan, report=self._hear)
                 if not member.is_twin or self.summary is None:
@@ -156,9 +154,6 @@ class World:
                 plant.run(bus, gains)
             else:
                 node.run(bus, gains, node=who.removeprefix("node-"))
-
-    def bus_of(self, member: Member) -> Bus | None:
-        return self._buses.get(member.process.name)
 
     def _ended(self, member: Member) -> None:
         """In a paced run, whoever ends while it goes on is started again."""
