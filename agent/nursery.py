@@ -45,13 +45,22 @@ def serve(connection: socket.socket, folder: str) -> None:
                 os.read(ended, LARGEST)
             _tell_who_has_ended(connection, children)
         if connection.fileno() in there:
-            request, streams, _, _ = socket.recv_fds(connection, LARGEST, 3)
+            request, streams = _next_request(connection)
             if not request:
                 poll.unregister(connection)
                 is_wanted = False
             else:
                 _do(json.loads(request), streams, connection, children)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def _next_request(connection: socket.socket) -> tuple[bytes, list[int]]:
+    """And the streams that go with it; nothing where whoever asks has gone."""
+    try:
+        request, streams, _, _ = socket.recv_fds(connection, LARGEST, 3)
+    except ConnectionResetError:  # they had not read all that they were told
+        return b"", []
+    return request, streams
 
 
 def _do(request: dict[str, Any], streams: list[int], connection: socket.socket, children: set[int]) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from runs import roles_left, wait_until_gone
+from runs import PATIENCE, roles_left, wait_until_gone
 
 from agent.children import Child, Nursery
 from agent.contract.errors import RunBroken
@@ -60,6 +61,17 @@ def test_a_nursery_leaves_nobody(lone_path: Path) -> None:
     assert child.code == -signal.SIGKILL
     assert roles_left() == {}
     assert not nursery.folder.exists()
+
+
+def test_a_nursery_ends_in_order_whatever_its_starter_has_not_read(nursery: Nursery) -> None:
+    """One that is killed may have been told of children's ends; the nursery's socket is then reset, not just closed."""
+    child = nursery.start(["run", "nowhere.json"], wants_output=False)
+    assert select.select([nursery._socket], [], [], PATIENCE)[0]  # told, and not read
+    nursery._socket.close()
+    child.close()
+    assert nursery._process.wait(PATIENCE) == 0
+    assert not nursery.folder.exists()
+    nursery._children.clear()  # as if they had been read: the fixture waits for nobody
 
 
 def test_children_of_a_nursery_that_is_killed_end(nursery: Nursery, lone_path: Path) -> None:
