@@ -359,14 +359,14 @@ def exactly_measured() -> Gains:
     other = B - 0.3 * B
     K = {"t": {"a": {"a": A}, "b": {"a": 0.3 * A, "b": A - 0.3 * A}}}
     H = {"t": {"a": {"a": B}, "b": {"a": 0.3 * B, "b": other}}}
-    claim = Certificate(gamma=1e-16, kind="exact", form="summed", holds=True, verified="by hand", margins={})
+    claim = Certificate(gamma=1e-20, kind="exact", form="summed", holds=True, verified="by hand", margins={})
     solver = Solver(name="none", version="-", status="by hand", iterations=0, seconds=0.0)
     parts = {"problem": problem, "problem_digest": problem.digest(), "method": "given", "seconds": {}}
     return Gains(**parts, K=K, H=H, certificate=claim, solver=solver)
 
 
 def test_rounding_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gamma of 1e-16 is true, and the simulation's own rounding is more than that: it knows how much more."""
+    """Errors of 1e-16 of w are its own rounding, so nothing is said of a gamma of 1e-20: it knows how much that may be."""
     gains = exactly_measured()
     assert simulation.simulate(gains, runs=400, steps=8).refuted_at is None
     monkeypatch.setattr(simulation, "_rounding", lambda *given: np.zeros(8))
