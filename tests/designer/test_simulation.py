@@ -366,7 +366,7 @@ def exactly_measured() -> Gains:
 
 
 def test_rounding_refutes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Errors of 1e-16 of w are its own rounding, so nothing is said of a gamma of 1e-20: it knows how much that may be."""
+    """Errors of 1e-16 are its own rounding, so nothing is said of a gamma of 1e-20; it knows how much they may be."""
     gains = exactly_measured()
     assert simulation.simulate(gains, runs=400, steps=8).refuted_at is None
     monkeypatch.setattr(simulation, "_rounding", lambda *given: np.zeros(8))

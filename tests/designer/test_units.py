@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -37,7 +38,7 @@ PROBLEMS = {"three-states": three_states, "two-nodes": lambda: find("two-nodes")
 
 @cache
 def designed(name: str) -> Gains:
-    return design(PROBLEMS[name](), method="exact")
+    return design(PROBLEMS[name](), method="exact", budget=math.inf)
 
 
 def in_units(problem: Problem, x: Array, y: float, w: float) -> Problem:
@@ -57,7 +58,7 @@ def in_units(problem: Problem, x: Array, y: float, w: float) -> Problem:
 def assert_same(name: str, x: Array, y: float, w: float, *, rtol: float) -> None:
     """The gains of the problem in these units, told in the units that it came in."""
     there = designed(name)
-    here = design(in_units(there.problem, x, y, w), method="exact")
+    here = design(in_units(there.problem, x, y, w), method="exact", budget=math.inf)
     assert verify(here).holds
     assert here.certificate.gamma == pytest.approx(w * there.certificate.gamma, rel=rtol)
     for mode, of_mode in there.K.items():
@@ -80,6 +81,6 @@ def test_powers_of_two_change_no_bit(name: str, x: Array) -> None:
 def test_states_in_micro_and_mega_units_have_the_same_gamma() -> None:
     """No power of two, so every number of the problem is rounded anew, and a flat minimum may be met elsewhere."""
     there = designed("three-states")
-    here = design(in_units(there.problem, np.array([1e-6, 1.0, 1e6]), 1e3, 1e-6), method="exact")
+    here = design(in_units(there.problem, np.array([1e-6, 1.0, 1e6]), 1e3, 1e-6), method="exact", budget=math.inf)
     assert verify(here).holds
     assert here.certificate.gamma == pytest.approx(1e-6 * there.certificate.gamma, rel=1e-3)
