@@ -38,6 +38,8 @@ def test_a_link_lasts_as_long_as_the_deadline(role: str, deadline: str, lease: f
     """It is the deadline that ends a run which an outage holds up, not a link that was given up before."""
     parser = argparse.ArgumentParser()
     add_roles(parser.add_subparsers(dest="command"), {})
-    network = network_of(parser.parse_args([role, "g", "--connect", "tcp/127.0.0.1:1", "--deadline", deadline]))
+    network = network_of(
+        parser.parse_args([role, "g", "--connect", "tcp/127.0.0.1:1", "--deadline", deadline]), role, None
+    )
     assert network.lease == lease
-    assert zenoh_configuration(network)["transport"]["link"]["tx"]["lease"] == 1000 * lease
+    assert zenoh_configuration(network, run="r")["transport"]["link"]["tx"]["lease"] == 1000 * lease
