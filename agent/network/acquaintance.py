@@ -83,3 +83,14 @@ def refuse_version(who: str, version: str, *, own: str) -> None:
     """Raise InputError where two versions do not go together: those do whose first two numbers are the same."""
     if version.split(".")[:2] != own.split(".")[:2]:
         raise InputError(f"{in_words(who)} is peakmesh {version or 'of unknown version'}, this is {own}: update one")
+
+
+def stray_sensor(who: str) -> str:
+    """What is wrong with somebody who is there and whom nobody expects; "" where it is no sensor."""
+    kind, _, node = who.partition("-")
+    if kind != "sensor":
+        return ""
+    return (
+        f"{in_words(who)} is there, but the run was started without --external {node}: the simulated plant measures "
+        "for its node, too"
+    )

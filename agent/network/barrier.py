@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.keys import CONTROL, COORDINATOR, in_words, joining
 from agent.contract.messages import Control, Joining, Leaving, Ready
-from agent.network.acquaintance import Acquaintance
+from agent.network.acquaintance import Acquaintance, stray_sensor
 from agent.network.addresses import machine
 from agent.network.configuration import Network
 from agent.network.words import Incoming, Namesake, Orphaned, Peer, RunClosed, UnderWay, Words
@@ -61,10 +61,12 @@ class Barrier:
         self._absent = set(self._expected)
         self._deadline = time.monotonic() + self.network.wait
         while self._absent:
-            who = self._wait_for(Peer, missing=self._absent).who
-            if who in self._absent:
-                self._absent.remove(who)
-                yield who
+            peer = self._wait_for(Peer, missing=self._absent)
+            if peer.who in self._absent:
+                self._absent.remove(peer.who)
+                yield peer.who
+            elif peer.present and peer.who not in self._expected and (doubt := stray_sensor(peer.who)):
+                self.warn(doubt)
 
     def gather(self, others: Iterable[str]) -> dict[str, Ready]:
         """The coordinator's: wait until everybody has met everybody. InputError where a name is there twice."""

@@ -7,7 +7,8 @@ What roles talk to. What makes it lose nothing:
   orders the start when all have told. Every two of those have a link of their own, a token is seen over that link
   alone, for peers pass on neither declarations nor messages, and declarations keep their order on a link: so whoever
   sees a token knows that peer's subscriptions. At the start, then, every publisher knows every subscription to what
-  it publishes, though most pairs of nodes know nothing of each other;
+  it publishes, though most pairs of nodes know nothing of each other. For a client, or behind a router, the same holds
+  of the way over those between: they pass on declarations in their order;
 * somebody who is lost is seen by those who have a link with it. The coordinator, plant and recorder have one with
   everybody, and the coordinator alone decides what follows, so nobody need see all the others;
 * every data message is numbered and kept until the recorder has acknowledged it (`outbox`), and the recorder can
@@ -67,6 +68,7 @@ from agent.signals import Handler, Handlers, heed, restore
 REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
 CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
 LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
+EXCUSE_SECONDS = 2.0  # for the coordinator to be there, for who cannot take part
 THREAD_SECONDS = 5.0  # for a thread to end once the session is closed
 GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
 ASK_SECONDS = 0.15  # and asks again
@@ -139,6 +141,13 @@ class Bus:
             reason = str(error) if isinstance(error, PeakmeshError) else f"{type(error).__name__}: {error}"
             with suppress(Exception):  # the first error is the one to be raised
                 self._say(leaving(self.who), Leaving(who=self.who, reason=reason))
+
+    def excuse(self) -> None:
+        """Join until the coordinator is seen, if it is there: it then learns what is raised next."""
+        self.enter()
+        deadline = time.monotonic() + EXCUSE_SECONDS
+        while COORDINATOR not in self.present and time.monotonic() < deadline:
+            self._words.take(deadline)
 
     def in_thread(self, work: Callable[[], None], *, name: str) -> None:
         """Do `work` beside the main thread; it ends by ChannelClosed once the session is closed, and is waited for."""

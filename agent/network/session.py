@@ -25,8 +25,9 @@ from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, R
 from agent.plan import LARGEST_WINDOW
 
 # Zenoh's pools of threads as one. Else what arrives wakes a thread of the pool that has accepted the connection, that
-# wakes one of the pool that receives, and an answer one of the pool that sends. It counts from the first session on.
-os.environ.setdefault("ZENOH_RUNTIME", "(tx:(handover:rx),net:(handover:rx),acc:(handover:rx),app:(handover:rx))")
+# wakes one of the pool that receives, and an answer one of the pool that sends. But who passes on what others say waits,
+# on a thread that receives, for one that sends: with one pool for both it would wait for itself.
+ONE_POOL = "(tx:(handover:rx),net:(handover:rx),acc:(handover:rx),app:(handover:rx))"
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
 BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word
@@ -67,6 +68,9 @@ class Session:
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._kind = network.kind
+        passes_on = network.routes or (who == COORDINATOR and network.sockets is None)  # clients may be there
+        if not passes_on:
+            os.environ.setdefault("ZENOH_RUNTIME", ONE_POOL)  # read once, when the first session of a process is opened
         self.traced = False  # whether messages are to say when they were where
         self._largest = network.largest
         self._zenoh = _open(network, run)

@@ -28,6 +28,7 @@ from agent.contract.keys import (
 )
 from agent.contract.messages import GONE, Acknowledged, BrokenOff, Control, Event, Mode, Ready
 from agent.contract.schedule import modes
+from agent.network.acquaintance import stray_sensor
 from agent.network.bus import Bus
 from agent.network.words import Incoming, Orphaned, Peer, Refused
 from agent.plan import Plan
@@ -197,6 +198,13 @@ class Conductor:
             case Peer(who=who, present=present) if self._takes_part(who):
                 self._announce("back" if present else GONE, in_words(who), about=who)
                 self._welcome(word)
+            case Peer(who=who, present=True):
+                self._doubt(who)
+
+    def _doubt(self, who: str) -> None:
+        """Somebody is there whom nobody expects."""
+        if doubt := stray_sensor(who):
+            self._report({"warning": doubt})
 
     def stood(self, seconds: float) -> None:
         """The clock of a paced run stood still."""
@@ -263,6 +271,8 @@ class Conductor:
                     self._heed(acknowledged.broken_off)
                 case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who, self._bus.reason_of(who))
+                case Peer(who=who, present=True) if not self._takes_part(who):
+                    self._doubt(who)
         self._report_progress()
 
     def _report_progress(self) -> None:

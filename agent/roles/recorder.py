@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from agent.contract.errors import Interrupted, RecordingFailed, RunBroken
+from agent.contract.errors import InputError, Interrupted, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT_STATE, RECORDER, decode, estimate, measurement, sender_of
 from agent.contract.messages import Acknowledged, BrokenOff, Control, Facts, Ready
@@ -45,7 +45,11 @@ def run(
     """
     cut = Cut.of(path)
     if cut is None or cut.run.get("run") != bus.run:
-        refuse_recording(path, force=force)
+        try:
+            refuse_recording(path, force=force)
+        except InputError:
+            bus.excuse()  # the others need not wait for us
+            raise
     names = gains.problem.node_names
     topics = [MODE, PLANT_STATE, EVENT, ACCOUNT, *map(measurement, names), *map(estimate, names)]
     channels = {topic: bus.channel(topic) for topic in topics}

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
+import pytest
 from made_recordings import observer_gains, real_problem
 from places import ROOT
 from runs import PATIENCE, logged, run_here
 
 from agent.authority import Authority
+from agent.contract.errors import Interrupted
 from agent.contract.gains import Gains
 from agent.contract.rights import everybody
 from designer.replay import replay
@@ -67,3 +72,38 @@ def test_sensor_that_has_nothing_to_say(tmp_path: Path) -> None:
     script.write_text(text.replace(reading, '"y": [0.5] if json.loads(mode)["step"] % 3 else []'))
     measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n1", steps=30)
     assert measured == [(k, [0.5] if k % 3 else []) for k in range(30)]
+
+
+def test_a_forgotten_external_is_warned_of(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
+    """Both the sensor and the simulated plant measure the node; whoever looks at the coordinator reads so."""
+    name = pair.problem.node_names[0]
+    warned = threading.Event()
+
+    def heed(word: dict[str, Any]) -> None:
+        if f"without --external {name}" in word.get("warning", ""):
+            warned.set()
+
+    def wait() -> None:
+        """The run goes on until the sensor was seen; then it is ended from here."""
+        assert warned.wait(PATIENCE)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    sensors: list[subprocess.Popen[bytes]] = []
+
+    def start_sensor(word: dict[str, Any]) -> None:
+        heed(word)
+        if "listening" in word:
+            sensors.append(subprocess.Popen([sys.executable, SENSOR, "test", name, word["listening"][0]]))
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    try:
+        with pytest.raises(Interrupted):
+            run_here(pair_path, tmp_path / "run.mcap", heed=start_sensor)
+        assert sensors[0].wait(PATIENCE) == 0
+    finally:
+        for process in sensors:
+            process.kill()
+            process.wait()
+        waiting.join()
+    assert warned.is_set()

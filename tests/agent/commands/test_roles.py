@@ -88,3 +88,18 @@ def test_unknown_node(pair_path: Path, pair: Gains) -> None:
         done = peakmesh(*arguments)
         assert done.returncode == 2
         assert 'peakmesh: node "9" does not exist; the problem has nodes' in done.stderr
+
+
+def test_a_recorder_that_may_not_write_tells_the_others(lone_path: Path, tmp_path: Path) -> None:
+    """Nobody waits for it: the coordinator says why there is no run."""
+    recording = tmp_path / "run.mcap"
+    recording.write_bytes(b"precious")
+    with started("coordinator", lone_path, "--wait", PATIENCE) as coordinator:
+        address = line_with(coordinator, "listening at").split()[-1]
+        recorder = peakmesh("recorder", lone_path, "-o", recording, "--connect", address)
+        said = line_with(coordinator, "peakmesh: ")
+        assert (recorder.returncode, coordinator.wait(PATIENCE)) == (2, 3)
+    why = f"{recording} exists already; give another name, or --force to replace it"
+    assert recorder.stderr == f"peakmesh: {why}\n"
+    assert said == f"peakmesh: the recorder left before the run had started; it said: {why}\n"
+    assert recording.read_bytes() == b"precious"

@@ -6,7 +6,7 @@ import pytest
 
 from agent.contract.errors import InputError
 from agent.contract.messages import Joining
-from agent.network.acquaintance import Acquaintance
+from agent.network.acquaintance import Acquaintance, stray_sensor
 
 HERE, THERE = "tcp/127.0.0.1:0", "tcp/0.0.0.0:0"
 
@@ -108,3 +108,8 @@ def test_a_shorter_patience_is_told(acquaintance: Acquaintance) -> None:
     assert acquaintance.heed(joining("plant", lease=30.0)) == ""
     said = acquaintance.heed(joining("recorder", lease=10.0))
     assert said.startswith("the recorder gives up a link after 10 s of silence, the coordinator after 20 s")
+
+
+def test_a_sensor_that_nobody_expects_is_named() -> None:
+    assert stray_sensor("sensor-a").startswith('sensor "a" is there, but the run was started without --external a: ')
+    assert [stray_sensor(who) for who in ("node-a", "plant", "viewer")] == [""] * 3

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from made_recordings import random_problem
 from networks import random_problem as dense_problem
+from places import ROOT
 from runs import PATIENCE
 
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, node_who, participants
@@ -110,9 +113,22 @@ def test_strangers_find_everybody(tmp_path: Path) -> None:
             assert list(plant.meet([RECORDER])) == [RECORDER]
 
 
-def test_a_session_has_one_pool_of_threads() -> None:
+THREADS = """
+import sys
+from pathlib import Path
+from agent.network.bus import Bus
+from agent.network.configuration import Network
+with Bus(Network(routes=sys.argv[1] == "router"), run="test", who=sys.argv[1]):
+    print(*{(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()})
+"""
+
+
+@pytest.mark.parametrize(("who", "one"), [("plant", True), ("coordinator", False), ("router", False)])
+def test_who_passes_nothing_on_has_one_pool_of_threads(who: str, one: bool) -> None:
     """Zenoh reads the variable that asks for it once; a version that no longer does makes this fail."""
-    with Bus(Network(), run="test", who=COORDINATOR):
-        names = {(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()}
-    assert "rx-0" in names
-    assert not [name for name in names if name.startswith(("tx-", "net-", "acc-", "app-"))]
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS, who], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    names = done.stdout.split()
+    assert any(name.startswith("rx-") for name in names)
+    assert one != any(name.startswith(("tx-", "net-", "acc-", "app-")) for name in names), names
