@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 import zenoh
@@ -25,8 +25,8 @@ from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, R
 from agent.plan import LARGEST_WINDOW
 
 # Zenoh's pools of threads as one. Else what arrives wakes a thread of the pool that has accepted the connection, that
-# wakes one of the pool that receives, and an answer one of the pool that sends. But who passes on what others say waits,
-# on a thread that receives, for one that sends: with one pool for both it would wait for itself.
+# wakes one of the pool that receives, and an answer one of the pool that sends. But who passes on what others say waits
+# on a thread that receives for one that sends: with one pool for both it would wait for itself.
 ONE_POOL = "(tx:(handover:rx),net:(handover:rx),acc:(handover:rx),app:(handover:rx))"
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
@@ -69,11 +69,10 @@ class Session:
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._kind = network.kind
         passes_on = network.routes or (who == COORDINATOR and network.sockets is None)  # clients may be there
-        if not passes_on:
-            os.environ.setdefault("ZENOH_RUNTIME", ONE_POOL)  # read once, when the first session of a process is opened
         self.traced = False  # whether messages are to say when they were where
         self._largest = network.largest
-        self._zenoh = _open(network, run)
+        with nullcontext() if passes_on else _one_pool():
+            self._zenoh = _open(network, run)
         self._zid = str(self._zenoh.zid())
         self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first
 
@@ -270,6 +269,19 @@ def _replayed(reply: zenoh.Reply) -> Sample | None:
     if sample is None or str(sample.key_expr).count("/") < 2:  # anybody may answer, under any key
         return None
     return _sample(topic_of(str(sample.key_expr)), sample)
+
+
+@contextmanager
+def _one_pool() -> Iterator[None]:
+    """Zenoh reads the variable once, when the first session of a process is opened; no child is to inherit it."""
+    is_given = "ZENOH_RUNTIME" in os.environ
+    if not is_given:
+        os.environ["ZENOH_RUNTIME"] = ONE_POOL
+    try:
+        yield
+    finally:
+        if not is_given:
+            del os.environ["ZENOH_RUNTIME"]
 
 
 def _open(network: Network, run: str) -> zenoh.Session:

@@ -176,20 +176,25 @@ def test_who_forgot_to_listen_for_others_is_named(three: Hosts, pair_path: Path,
     )
 
 
-def test_a_router_passes_everything_on(lone_path: Path, tmp_path: Path) -> None:
-    """Everybody is its client, the coordinator too; nothing is lost, and a signal is its good end."""
+@pytest.mark.parametrize("through", ["router", "coordinator"])
+def test_whoever_clients_are_connected_to_passes_everything_on(lone_path: Path, tmp_path: Path, through: str) -> None:
+    """The router, of which the coordinator is a client too, or the coordinator; nothing is lost."""
     recording, node = tmp_path / "run.mcap", Gains.load(lone_path).problem.node_names[0]
-    with started("router", "--listen", "tcp/127.0.0.1:0") as router, ExitStack() as stack:
-        place = ["--listen", "none", "--connect", line_with(router, "listening at").split()[-1]]
+    coordinator: list[object] = ["coordinator", lone_path, "--steps", 200]
+    with ExitStack() as stack:
+        hub = ["router"] if through == "router" else coordinator
+        first = stack.enter_context(started(*hub, "--listen", "tcp/127.0.0.1:0"))
+        place = ["--listen", "none", "--connect", line_with(first, "listening at").split()[-1]]
         roles: list[list[object]] = [
-            ["coordinator", lone_path, "--steps", 60],
             ["recorder", lone_path, "-o", recording],
             ["node", lone_path, "--node", node],
             ["plant", lone_path],
+            *([coordinator] if through == "router" else []),
         ]
         processes = [stack.enter_context(started(*words, *place)) for words in roles]
         assert all_well(processes)
-        router.terminate()
-        assert router.wait(PATIENCE) == 0
+        if through == "router":
+            first.terminate()  # its good end
+        assert first.wait(PATIENCE) == 0
     verdict = replay(recording)
-    assert (verdict.exit_code, verdict.steps, verdict.missing.total) == (0, 60, 0), verdict.text()
+    assert (verdict.exit_code, verdict.steps, verdict.missing.total) == (0, 200, 0), verdict.text()

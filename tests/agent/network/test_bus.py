@@ -14,8 +14,8 @@ import pytest
 from runs import PATIENCE
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
-from agent.contract.keys import CONTROL, COORDINATOR, EVENT, MODE, PLANT, PLANT_STATE, RECORDER
-from agent.contract.messages import Acknowledged, Control, Event, Mode, PlantState
+from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
+from agent.contract.messages import Acknowledged, Control, Mode
 from agent.network import barrier, bus
 from agent.network.addresses import NONE
 from agent.network.bus import REPLAY_SECONDS, Bus
@@ -332,29 +332,6 @@ def test_threads_have_ended_when_a_participant_has_left(coordinator: Bus) -> Non
 
         plant.in_thread(wait, name="waiting")
     assert [thread.is_alive() for thread in threads] == [False]
-
-
-def test_a_client_takes_part(coordinator: Bus) -> None:
-    """It listens nowhere: everything goes through the coordinator, to and from peers that it has no link with."""
-    address = coordinator.locators()[0]
-    peer, client = Network(connect=(address,), wait=PATIENCE), Network(NONE, (address,), PATIENCE)
-    with Bus(peer, run="test", who=RECORDER) as recorder, Bus(client, run="test", who=PLANT) as plant:
-        channel, back = recorder.channel(PLANT_STATE), plant.channel(EVENT)
-        plant.advertise([PLANT_STATE])
-        recorder.advertise([EVENT])
-        for one in (recorder, plant):
-            one.enter()
-        assert plant.locators() == []
-        list(recorder.meet([COORDINATOR, PLANT]))
-        list(plant.meet([COORDINATOR, RECORDER]))
-        for step in range(100):
-            plant.publish(PLANT_STATE, PlantState(step=step, x=[0.0], z=[0.0], w=[0.0], arrived=[1]))
-            recorder.publish(EVENT, Event(step=step, kind="a", who=RECORDER, detail=""))
-        assert [PlantState.decode(channel.next().payload).step for _ in range(100)] == list(range(100))
-        assert [Event.decode(back.next().payload).step for _ in range(100)] == list(range(100))
-        recorder.request_replay(PLANT, first=90)
-        answer(plant)
-        assert len(list(recorder.replayed([PLANT]))) == 10
 
 
 def test_a_client_that_reaches_nobody_says_so() -> None:
