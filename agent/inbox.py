@@ -1,7 +1,7 @@
 """What a node must have before it may go on: its measurement, the mode, the pairs of those it hears. Pure.
 
 Messages may come in any order and some steps early; they are matched by (step, sender), never by time. What
-belongs to a finished step is dropped.
+belongs to a finished step is dropped. That a message fits the problem, `guard` has seen to.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from collections.abc import Container
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import counted, listed
 from agent.contract.gains import NodeGains
 from agent.contract.messages import Estimate, Measurement, Message, Mode
 from agent.filter import Pair
@@ -23,40 +22,22 @@ class Inbox:
 
     def __init__(self, gains: NodeGains) -> None:
         self._hears = {mode: [link.sender for link in links] for mode, links in gains.links.items()}
-        self._ny, self._seen = gains.C.shape[0], gains.seen
-        self._sizes = {  # of each sender's pair
-            link.sender: (link.K.shape[1], link.H.shape[1]) for links in gains.links.values() for link in links
-        }
         self._step = 0
         self._measurements: dict[int, Array] = {}
         self._modes: dict[int, str] = {}
         self._pairs: defaultdict[int, dict[str, Pair]] = defaultdict(dict)
 
     def put(self, sender: str, message: Message) -> None:
-        """Take in a message; `sender` is the node that an estimate is from. ValueError where it does not fit."""
+        """Take in a message; `sender` is the node that an estimate is from. The first of a step counts, no other."""
         if message.step < self._step:
             return
         match message:
             case Mode(step=step, mode=mode):
-                if mode not in self._hears:
-                    raise ValueError(f'mode "{mode}" does not exist; the gains have {listed(self._hears)}')
-                self._modes[step] = mode
+                self._modes.setdefault(step, mode)
             case Measurement(step=step, y=y):
-                if len(y) != self._ny and (y or not self._seen):
-                    raise ValueError(
-                        f"the measurement of step {step} has {counted(len(y), 'number')}; it must have {self._ny}"
-                    )
-                self._measurements[step] = np.array(y)
+                self._measurements.setdefault(step, np.array(y))
             case Estimate(step=step, x_hat=x_hat, innovation=innovation):
-                if sender not in self._sizes:
-                    raise ValueError(f'node "{sender}" is heard in no mode; heard are {listed(self._sizes)}')
-                sizes = len(x_hat), len(innovation)
-                if sizes != self._sizes[sender]:
-                    raise ValueError(
-                        f'the estimate of step {step} from node "{sender}" has {counted(sizes[0], "state")} and '
-                        f"{counted(sizes[1], 'innovation')}; it must have {' and '.join(map(str, self._sizes[sender]))}"
-                    )
-                self._pairs[step][sender] = Pair(np.array(x_hat), np.array(innovation))
+                self._pairs[step].setdefault(sender, Pair(np.array(x_hat), np.array(innovation)))
 
     @property
     def y(self) -> Array | None:

@@ -35,7 +35,7 @@ from designer.replay.inputs import draw, logged_inputs
 from designer.replay.proofs import to_be_heard
 from designer.report.account import Account
 
-BASES = {Frozen, Model, messages.Message}  # of which there are no instances
+BASES = {Frozen, Model, messages.Message, messages.Word}  # of which there are no instances
 LOSSY = problems.find("zhu2020-lossy")
 PLANT, NODES = LOSSY.plant, LOSSY.nodes
 
@@ -123,6 +123,7 @@ def examples() -> dict[type, Frozen]:
         ),
         messages.Leaving(who="plant", reason="b"),
         messages.Ready(who="node-1", session="a", gains="b"),
+        messages.Refusals(who="node-1", counts={"mode": {"forged": 1}}),
         messages.Control(order="start", steps=1, seed=0, window=1, external=[], reason=""),
         messages.Facts(
             start=messages.Control(order="start", steps=1, seed=0, window=1, external=["1"], reason=""), gains="{}"

@@ -31,6 +31,8 @@ def say_to_person(word: dict[str, Any]) -> None:
             say_warning(sentence)
         case {"summary": summary}:
             print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
+            for line in refused_text(summary.get("refused", {})):
+                print(line)
             if summary["broken_off"]:
                 print(f"NOT RECORDED TO THE END: {summary['broken_off']}")
 
@@ -97,7 +99,22 @@ def run_text(result: dict[str, Any]) -> str:
         lines.insert(1, f"NOT RECORDED TO THE END: {result['broken_off']}")
     if "pacing" in result:
         lines[1:1] = pacing_text(result["pacing"])
+    if "refused" in result:
+        lines[1:1] = refused_text(result["refused"])
     return "\n".join(lines)
+
+
+def refused_text(refused: dict[str, dict[str, dict[str, int]]]) -> list[str]:
+    """What did not fit, for people: by whom it was refused, on which topic, and why."""
+    from agent.contract.errors import counted
+    from agent.contract.keys import in_words
+    from agent.guard import in_words as kinds_in_words
+
+    return [
+        f"refused    {counted(sum(kinds.values()), 'message')} on {topic} by {in_words(who)}: {kinds_in_words(kinds)}"
+        for who, counts in refused.items()
+        for topic, kinds in counts.items()
+    ]
 
 
 def pacing_text(pacing: dict[str, Any]) -> list[str]:

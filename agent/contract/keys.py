@@ -24,6 +24,7 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 | ready/<who>            | Ready       | everyone but sensors       | coordinator, recorder: it has seen others  |
 | control                | Control     | coordinator                | everyone: start, close, stop               |
 | acknowledged           | Acknowledged| recorder                   | publishers, coordinator                    |
+| refusals/<who>         | Refusals    | everyone but sensors       | coordinator: what was refused of others    |
 | replay/<who>           | queryable   | publishers                 | recorder: messages from ?from=<number> on  |
 | facts                  | Facts       | recorder, when asked       | viewers: what run this is                  |
 | watch/<data topic>     | the same    | publishers, to viewers     | viewers, where there are any, without stamp|
@@ -35,8 +36,8 @@ The recorder writes one more topic to the file, which is never on the wire:
 | evidence               | Evidence    | recorder                   | whoever checks a recording                 |
 
 The models are in `messages`. Every data message carries an attachment: its number among the sender's messages, the
-sender's clock, the sender's name, a digest of the message (`messages.Stamp`). A sensor driver may leave it out, or
-the digest alone.
+sender's clock, the sender's name, a digest of the message, a tag of the sender's session (`messages.Stamp`). A sensor
+driver may leave it out, or all that follows the name.
 """
 
 from __future__ import annotations
@@ -153,6 +154,10 @@ def leaving(who: str) -> str:
 
 def ready(who: str) -> str:
     return f"ready/{who}"
+
+
+def refusals(who: str) -> str:
+    return f"refusals/{who}"
 
 
 def replay(who: str) -> str:

@@ -14,6 +14,7 @@ from pydantic import ConfigDict, Field
 from agent.contract.frozen import Frozen
 
 _UNIT = "in the units of the problem"
+CEILING = 1e140  # of every number in a message: squares of larger ones overflow where messages are judged
 
 
 class Message(Frozen):
@@ -84,7 +85,8 @@ class Estimate(Message):
 
 
 ZERO_STATE = "the zero state"  # no node has such a name
-LATE, SILENT, GONE = "late", "silent", "gone"  # kinds of events: why their `about` was substituted
+# kinds of events: why their `about` was substituted
+LATE, SILENT, GONE, REFUSED = "late", "silent", "gone", "refused"
 
 
 class Event(Message):
@@ -152,7 +154,14 @@ class Evidence(Message):
     head: str = Field(pattern=r"^[0-9a-f]{32}$")
 
 
-class Joining(Frozen):
+class Word(Frozen):
+    """What runs the run: each says which session it is from, and its number among all words of that session."""
+
+    session: str = ""
+    number: int = Field(default=0, ge=0)
+
+
+class Joining(Word):
     """`who` is there, as the coordinator needs to know it before the run can start.
 
     `listen` is where it was asked to listen, `machine` whose network it is on, "" where that cannot be said; `lacks`
@@ -160,7 +169,6 @@ class Joining(Frozen):
     """
 
     who: str
-    session: str
     version: str
     listen: str
     machine: str
@@ -168,22 +176,21 @@ class Joining(Frozen):
     lacks: list[str]
 
 
-class Leaving(Frozen):
+class Leaving(Word):
     """`who` leaves, because `reason`."""
 
     who: str
     reason: str
 
 
-class Ready(Frozen):
-    """`who`, with the zenoh session `session`, has seen everybody's token; `gains` is the digest of its gains.
+class Ready(Word):
+    """`who` has seen everybody's token; `gains` is the digest of its gains.
 
     Said again to a coordinator that has come back, `underway`: `step` is the first of which `who` has had no mode. Said
     to the recorder, it `asks` for a greeting.
     """
 
     who: str
-    session: str
     gains: str
     underway: bool = False
     asks: bool = False
@@ -191,7 +198,7 @@ class Ready(Frozen):
     identity: str = ""  # of the run that it has seen begin
 
 
-class Control(Frozen):
+class Control(Word):
     """The coordinator's word.
 
     "start": the facts of the run; "close": all its steps are done and recorded; "stop": end now, because `reason`;
@@ -240,7 +247,7 @@ class BrokenOff(Frozen):
         return f"{self.reason}; there is no recording from step {self.steps} on"
 
 
-class Acknowledged(Frozen):
+class Acknowledged(Word):
     """The recorder's word: it has the first `received[who]` messages of everyone, and every step < `steps`.
 
     `messages` are recorded, `missing` are known to lack. `reached[who]` is the last step of which it has anything of
@@ -259,21 +266,30 @@ class Acknowledged(Frozen):
     greets: str = ""  # who has just joined: `received` holds the number of their next message
 
 
+class Refusals(Word):
+    """What `who` has refused since it began: how many messages, by topic and by kind of fault."""
+
+    who: str
+    counts: dict[str, dict[str, int]]
+
+
 class Stamp(NamedTuple):
     """The attachment of a data message: `number` counts the sender's messages from 0, `time` is in ns.
 
-    `digest` is `digest_of` the message, or b"" where the sender gives none.
+    `digest` is `digest_of` the message, or b"" where the sender gives none. `session` is `tag_of` the sender's session.
     """
 
     number: int
     time: int
     sender: str
     digest: bytes = b""
+    session: bytes = b""
 
     def encode(self) -> bytes:
-        """Number and time, the sender's name, and after a zero byte the digest."""
+        """Number and time, the sender's name, and after a zero byte the digest and the session."""
         name = self.sender.encode()
-        return _STAMP.pack(self.number, self.time) + (name + b"\0" + self.digest if self.digest else name)
+        rest = name + b"\0" + self.digest + self.session if self.digest else name
+        return _STAMP.pack(self.number, self.time) + rest
 
     @classmethod
     def decode(cls, attachment: bytes) -> Self:
@@ -281,14 +297,19 @@ class Stamp(NamedTuple):
         if len(attachment) <= _STAMP.size:
             raise ValueError(f"a stamp is longer than {_STAMP.size} bytes, this one has {len(attachment)}")
         number, time = _STAMP.unpack_from(attachment)
-        name, zero, digest = attachment[_STAMP.size :].partition(b"\0")
-        if len(digest) != (DIGEST_SIZE if zero else 0):
-            raise ValueError(f"a digest has {DIGEST_SIZE} bytes, this one has {len(digest)}")
-        return cls(number, time, name.decode(), digest)
+        name, zero, rest = attachment[_STAMP.size :].partition(b"\0")
+        if len(rest) not in ((DIGEST_SIZE, DIGEST_SIZE + TAG_SIZE) if zero else (0,)):
+            raise ValueError(f"a digest has {DIGEST_SIZE} bytes, this one has {len(rest)}")
+        return cls(number, time, name.decode(), rest[:DIGEST_SIZE], rest[DIGEST_SIZE:])
 
 
 _STAMP = struct.Struct("<QQ")
-DIGEST_SIZE = 16  # bytes
+DIGEST_SIZE, TAG_SIZE = 16, 8  # bytes
+
+
+def tag_of(session: str) -> bytes:
+    """A session, short enough for every message: BLAKE2b, 8 bytes."""
+    return hashlib.blake2b(session.encode(), digest_size=TAG_SIZE).digest()
 
 
 def digest_of(topic: str, payload: bytes) -> bytes:

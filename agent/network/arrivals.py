@@ -1,4 +1,4 @@
-"""Messages of several channels with the time at which each arrived, for whoever works against the clock."""
+"""What comes from several sources with the time at which each arrived, for whoever works against the clock."""
 
 from __future__ import annotations
 
@@ -8,55 +8,73 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from agent.contract.messages import Way
-from agent.network.session import Channel, way_of
-from agent.network.words import ChannelClosed, Sample
+from agent.network.session import CAPACITY, way_of
+from agent.network.words import ChannelClosed, Quota, Sample
+
+T = TypeVar("T")
 
 
-class Arrival(NamedTuple):
+class Arrival(NamedTuple, Generic[T]):
     """A message, and when it arrived, on time.monotonic()."""
 
-    sample: Sample
+    sample: T
     at: float
 
-    def way(self) -> Way | None:
-        """Where it spent its time, as far as it says."""
-        return way_of(self.sample.trace, self.at + time.time() - time.monotonic())
 
+class Arrivals(Generic[T]):
+    """What these sources give from now on, which nobody else may ask any more; a thread for each waits there.
 
-class Arrivals:
-    """What comes on these channels from now on, which nobody else may ask for any more; a thread for each waits there.
-
-    A thread's clock is read when the message is there, whatever the one who computes is doing. `in_thread` starts it.
+    A source blocks until it has something, and raises ChannelClosed at its end. A thread's clock is read when the
+    message is there, whatever the one who computes is doing; `in_thread` starts it. What is too much to wait for that
+    one is left out, and given to `overflow`.
     """
 
-    def __init__(self, channels: Iterable[Channel], *, in_thread: Callable[..., None] | None = None) -> None:
-        self._queue: SimpleQueue[Arrival | None] = SimpleQueue()  # None: a channel has closed
-        for channel in channels:
-            (in_thread or _daemon)(partial(self._watch, channel), name="arrivals")
+    def __init__(
+        self,
+        sources: Iterable[Callable[[], T]],
+        *,
+        in_thread: Callable[..., None] | None = None,
+        overflow: Callable[[T], None] = lambda left: None,
+    ) -> None:
+        self._queue: SimpleQueue[tuple[Quota, Arrival[T]] | None] = SimpleQueue()  # None: a source has closed
+        self._overflow = overflow
+        for source in sources:
+            (in_thread or _daemon)(partial(self._watch, source), name="arrivals")
 
-    def until(self, deadline: float) -> Iterator[Arrival]:
+    def until(self, deadline: float) -> Iterator[Arrival[T]]:
         """What has arrived, once something has; nothing where the deadline passes first. Raises ChannelClosed."""
         left = deadline - time.monotonic()
         try:
-            arrival = self._queue.get(timeout=None if left == math.inf else max(0.0, left))
+            came = self._queue.get(timeout=None if left == math.inf else max(0.0, left))
             while True:
-                if arrival is None:
+                if came is None:
                     raise ChannelClosed
+                quota, arrival = came
+                quota.leave()
                 yield arrival
-                arrival = self._queue.get_nowait()
+                came = self._queue.get_nowait()
         except Empty:
             return
 
-    def _watch(self, channel: Channel) -> None:
+    def _watch(self, source: Callable[[], T]) -> None:
+        quota = Quota(CAPACITY)
         try:
             while True:
-                sample = channel.next()
-                self._queue.put(Arrival(sample, time.monotonic()))
+                sample = source()
+                if quota.enter():
+                    self._queue.put((quota, Arrival(sample, time.monotonic())))
+                else:
+                    self._overflow(sample)
         except ChannelClosed:
             self._queue.put(None)
+
+
+def way(sample: Sample, at: float) -> Way | None:
+    """Where a sample that arrived `at`, on time.monotonic(), spent its time, as far as it says."""
+    return way_of(sample.trace, at + time.time() - time.monotonic())
 
 
 def _daemon(work: Callable[[], None], *, name: str) -> None:

@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import version
 from typing import TypeVar
 
-from pydantic import BaseModel
-
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.keys import CONTROL, COORDINATOR, in_words, joining
-from agent.contract.messages import Control, Joining, Leaving, Ready
+from agent.contract.messages import Control, Joining, Leaving, Ready, Word
 from agent.network.acquaintance import Acquaintance, stray_sensor
 from agent.network.addresses import machine
 from agent.network.configuration import Network
@@ -41,7 +39,7 @@ class Barrier:
         who: str,
         identity: str,
         words: Words,
-        say: Callable[[str, BaseModel], None],
+        say: Callable[[str, Word], None],
         heed_namesake: Callable[[str], None],
     ) -> None:
         self.network, self._run, self._who, self._identity = network, run, who, identity

@@ -30,9 +30,9 @@ from threading import Thread
 from types import FrameType, TracebackType
 from typing import Self, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from agent.contract.errors import Interrupted, PeakmeshError, RunBroken, first_fault
+from agent.contract.errors import Interrupted, PeakmeshError, RunBroken
 from agent.contract.keys import (
     ACKNOWLEDGED,
     CONTROL,
@@ -44,15 +44,31 @@ from agent.contract.keys import (
     leaving,
     model_of,
     ready,
+    refusals,
     refused,
 )
-from agent.contract.messages import Acknowledged, Control, Estimate, Facts, Joining, Leaving, Message, Ready
+from agent.contract.messages import (
+    Acknowledged,
+    Control,
+    Estimate,
+    Facts,
+    Joining,
+    Leaving,
+    Message,
+    Ready,
+    Refusals,
+    Word,
+    tag_of,
+)
+from agent.guard import FLOOD, MISNUMBERED, OVERSIZED, UNREADABLE, Guard, Unfit
 from agent.network.barrier import REASON_SECONDS, Barrier
 from agent.network.configuration import Network
+from agent.network.gate import Gate
 from agent.network.outbox import Outbox
-from agent.network.session import Channel, Session
+from agent.network.session import CAPACITY, Session
 from agent.network.words import (
     ChannelClosed,
+    Ignored,
     Incoming,
     Namesake,
     Peer,
@@ -72,9 +88,13 @@ EXCUSE_SECONDS = 2.0  # for the coordinator to be there, for who cannot take par
 THREAD_SECONDS = 5.0  # for a thread to end once the session is closed
 GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
 ASK_SECONDS = 0.15  # and asks again
+HOUSE_SECONDS = 0.5  # between two looks after the queues
+BUSY_SECONDS = 0.01  # where one of them was filling
+TELL_SECONDS = 1.0  # between two words on what was refused
+LONGEST_WORD = 1 << 20  # bytes
 
 T = TypeVar("T")
-Word = TypeVar("Word", Control, Acknowledged, Joining, Leaving, Ready)
+Said = TypeVar("Said", Control, Acknowledged, Joining, Leaving, Ready, Refusals)
 
 
 class Bus:
@@ -94,8 +114,12 @@ class Bus:
     ) -> None:
         """`session` opens the door to zenoh, `signals` asks for those that end a program; a simulation has its own."""
         self.run, self.who, self.network = run, who, network
-        self._words = Words(who)
-        self._outbox = Outbox(who)
+        self._words = Words(who, meanwhile=self._keep_house)
+        self.guard = Guard()  # whoever knows the problem tells it
+        self._gates: list[Gate] = []
+        self._house_due = self._told = 0.0  # when to look after the house; when we last told what was refused
+        self._reported = 0  # messages that we have told of
+        self._word = 0  # number of our next word
         self._unanswered: Counter[str] = Counter()  # requests for replay, by whom they were made to
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
@@ -109,6 +133,7 @@ class Bus:
         self.identity = ""  # of the run
         self._threads: list[Thread] = []
         self._session = session(network, run=run, who=who, hand_over=self._words.put)
+        self._outbox = Outbox(who, session=tag_of(self._session.identity))
         self._barrier = Barrier(
             network,
             run=run,
@@ -166,32 +191,52 @@ class Bus:
         return self._words.present
 
     # Declare: first what we receive, then what we send, the token last.
-    def channel(self, topic: str) -> Channel:
-        """Receive a topic's messages."""
-        return self._session.channel(topic)
+    def channel(self, topic: str) -> Gate:
+        """Receive a topic's messages; what does not fit does not come in."""
+        gate = Gate(self._session.channel(topic), self.guard, for_record=self.who == RECORDER)
+        self._gates.append(gate)
+        return gate
 
     def advertise(self, topics: Iterable[str]) -> None:
         """Announce that these topics will be published, and offer replays of them."""
-        self._session.offer_replay(self.who, self._outbox.since)
+        self._session.offer_replay(self.who, self._outbox.since, is_for=lambda by: self.guard.trusts(RECORDER, by))
         for topic in topics:
             express = model_of(topic) is Estimate  # the only message that somebody waits for right now
             self._session.advertise(topic, express=express)
 
     def enter(self) -> None:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
+        self._session.watch(self._see)  # first: who says something has shown its token before
         if self.who in (COORDINATOR, RECORDER):
             self._listen(ready("*"), Ready)
         if self.who == COORDINATOR:
             self._listen(joining("*"), Joining)
             self._listen(leaving("*"), Leaving)
+            self._listen(refusals("*"), Refusals)
         else:
             self._listen(CONTROL, Control)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
-        self._session.listen(refused(self.who, self._session.identity), self._refuse)
-        self._session.watch()
-        self._session.watch_namesakes(self.who)
+        self._session.listen(refused(self.who, self._session.identity), self._refuse, overflow=lambda: None)
         self._session.appear(self.who)
+
+    def _see(self, who: str, session: str, present: bool) -> None:
+        """Somebody has come or gone; called on zenoh's threads."""
+        if not self.guard.takes_part(who):
+            return
+        if self.guard.came(who, session) if present else self.guard.went(who, session):
+            self._words.put(lambda: Peer(who, present))
+        if who == self.who and present:
+            self._words.put(lambda: Namesake(session))
+
+    def _refuse(self, sentence: bytes) -> Ignored:
+        """Our place is taken, says a namesake; nobody can say so who is not there.
+
+        Where that one has joined our run unseen, it is theirs to go.
+        """
+        if (self.has_begun and not self.is_late) or not self.guard.are_several(self.who):
+            return Ignored()
+        raise Refused(f'{in_words(self.who)} takes part in run "{self.run}" already; start it once')
 
     def _heed_namesake(self, identity: str) -> None:
         """Of two processes with one name the one stays that has begun, else the earlier one. Raises Refused."""
@@ -202,25 +247,31 @@ class Bus:
         elif identity < own:
             raise Refused(sentence)
 
-    def _refuse(self, sentence: bytes) -> None:
-        """Our place is taken, says a namesake. Where that one has joined our run unseen, it is theirs to go."""
-        if not self.has_begun or self.is_late:
-            raise Refused(sentence.decode(errors="replace"))
+    def _listen(self, topic: str, model: type[Said], *, heed: Callable[[Said], None] = lambda word: None) -> None:
+        name = topic.partition("/")[0]
 
-    def _listen(self, topic: str, model: type[Word], *, heed: Callable[[Word], None] = lambda word: None) -> None:
-        def decode(payload: bytes) -> Word:
+        def decode(payload: bytes) -> Said | Ignored:
             try:
+                if len(payload) > LONGEST_WORD:
+                    raise Unfit(OVERSIZED)
                 word = model.model_validate_json(payload)
-            except ValidationError as error:
-                fault = first_fault(error, {})
-                raise RunBroken(f"what came on {topic} is not from peakmesh: {fault}") from None
-            heed(word)
-            return word
+                self.guard.admit_word(_speaker(word), name, word, second=not isinstance(word, Acknowledged | Control))
+                heed(word)
+                return word
+            except ValidationError:
+                self.guard.refuse(name, UNREADABLE)
+            except Unfit as unfit:
+                self.guard.refuse(name, unfit.kind)
+            return Ignored()
 
-        self._session.listen(topic, decode)
+        self._session.listen(topic, decode, overflow=lambda: self.guard.refuse(name, FLOOD))
 
     def _forget(self, acknowledged: Acknowledged) -> None:
-        self._outbox.forget(acknowledged.received.get(self.who, 0))
+        """What the recorder has need not be kept. Raises Unfit where it says that it has more than was sent."""
+        received = acknowledged.received.get(self.who, 0)
+        if received > self._outbox.number and self._outbox.has_sent:
+            raise Unfit(MISNUMBERED)
+        self._outbox.forget(received)
         self._last_word = acknowledged if acknowledged.closed else None
 
     # Start together; `barrier` has the rest.
@@ -242,7 +293,7 @@ class Bus:
 
     def report_ready(self, gains: str) -> None:
         """Tell the coordinator that we have met everybody, and which gains we run on."""
-        self._ready = Ready(who=self.who, session=self._session.identity, gains=gains)
+        self._ready = Ready(who=self.who, gains=gains)
         self._say(ready(self.who), self._ready)
 
     def gather_underway(self, first: Ready, *, seconds: float) -> dict[str, Ready]:
@@ -268,7 +319,7 @@ class Bus:
         `heed` gets what else is heard.
         """
         deadline = time.monotonic() + seconds
-        asks = Ready(who=self.who, session=self._session.identity, gains="", asks=True)
+        asks = Ready(who=self.who, gains="", asks=True)
         while time.monotonic() < deadline:
             self._say(ready(self.who), asks)  # until it is heard: the recorder may be on its way back, too
             again = time.monotonic() + ASK_SECONDS
@@ -292,6 +343,11 @@ class Bus:
         """Have what is published from now on say when it was where, so that a receiver knows why it is late."""
         self._session.traced = True
 
+    @property
+    def published(self) -> int:
+        """How many messages we have sent."""
+        return self._outbox.number
+
     def receive(self, *, timeout: float = math.inf) -> Incoming | None:
         """The next word for the main thread; None where `timeout` seconds have passed.
 
@@ -305,6 +361,7 @@ class Bus:
                 raise RunBroken(f"the coordinator was lost, and did not come back within {self.network.wait:g} s")
             match word:
                 case Control(order="close" | "stop"):
+                    self._tell_refused()
                     raise RunClosed(word)
                 case Namesake(identity=identity):
                     self._heed_namesake(identity)
@@ -356,8 +413,31 @@ class Bus:
         self._unanswered[who] += 1
         self._session.request_replay(who, first=first, seconds=CLOSE_SECONDS)
 
-    def _say(self, topic: str, word: BaseModel) -> None:
-        self._session.say(topic, word.model_dump_json().encode())
+    def _say(self, topic: str, word: Word) -> None:
+        """Send a word, with our session and its number."""
+        signed = word.model_copy(update={"session": self._session.identity, "number": self._word})
+        self._word += 1
+        self._session.say(topic, signed.model_dump_json().encode())
+
+    # Meanwhile.
+    def _keep_house(self) -> float:
+        """See that no queue of zenoh's is full, and tell the coordinator what was refused; when to do so again."""
+        now = time.monotonic()
+        if now < self._house_due:
+            return self._house_due
+        fullest = max((gate.relieve() for gate in self._gates), default=0)
+        self._house_due = now + (HOUSE_SECONDS if fullest < CAPACITY // 8 else BUSY_SECONDS)
+        if now >= self._told + TELL_SECONDS:
+            self._told = now
+            self._tell_refused()
+        return self._house_due
+
+    def _tell_refused(self) -> None:
+        """Tell the coordinator what we have refused, where there is something new."""
+        total = self.guard.total
+        if total > self._reported and self.who != COORDINATOR:
+            self._reported = total
+            self._say(refusals(self.who), Refusals(who=self.who, counts=self.guard.refused()))
 
     # End together.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
@@ -370,14 +450,15 @@ class Bus:
             if isinstance(word, Sample):
                 yield word
 
-    def wait_for_close(self) -> Acknowledged | None:
+    def wait_for_close(self, heed: Callable[[Incoming | None], None] = lambda word: None) -> Acknowledged | None:
         """Answer replays until the recorder has closed the recording; None where it has not.
 
-        In a paced run the recorder may just be on its way back; the coordinator, whose end it is, knows.
+        In a paced run the recorder may just be on its way back; the coordinator, whose end it is, knows. `heed` gets
+        what is heard meanwhile.
         """
         keepers, present = {RECORDER, COORDINATOR} if self.patient else {RECORDER}, self._words.present
-        for _ in self._until(lambda: self._last_word is not None or not keepers & present, silence=CLOSE_SECONDS):
-            pass
+        for word in self._until(lambda: self._last_word is not None or not keepers & present, silence=CLOSE_SECONDS):
+            heed(word)
         return self._last_word
 
     def wait_until_there(self, whos: Iterable[str]) -> None:
@@ -417,6 +498,16 @@ class Bus:
     def _interrupt(self, number: int) -> None:
         if not self._leaving:
             raise Interrupted(number)
+
+
+def _speaker(word: Said) -> str:
+    """Who says such a word."""
+    match word:
+        case Ready() | Refusals() | Joining() | Leaving():
+            return word.who
+        case Acknowledged():
+            return RECORDER
+    return COORDINATOR
 
 
 def _raise(error: BaseException) -> None:

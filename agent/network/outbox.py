@@ -21,19 +21,32 @@ class Sent(NamedTuple):
 class Outbox:
     """The messages of `who`. One thread may add while another forgets and replays."""
 
-    def __init__(self, who: str) -> None:
-        self._who = who
+    def __init__(self, who: str, *, session: bytes = b"") -> None:
+        """`session` is the tag of the session that they are sent in."""
+        self._who, self._session = who, session
         self._number = 0  # of the next message
         self._kept: deque[Sent] = deque()
+        self._has_sent = False
 
     def __len__(self) -> int:
         return len(self._kept)
 
+    @property
+    def has_sent(self) -> bool:
+        """Whether this process has sent any."""
+        return self._has_sent
+
+    @property
+    def number(self) -> int:
+        """Of the next message: so many were sent, in this process and those before it."""
+        return self._number
+
     def add(self, topic: str, payload: bytes) -> Sent:
         """Number a message, say what is in it, and keep it."""
-        stamp = Stamp(self._number, time.time_ns(), self._who, digest_of(topic, payload))
+        stamp = Stamp(self._number, time.time_ns(), self._who, digest_of(topic, payload), self._session)
         sent = Sent(topic, payload, stamp)
         self._number += 1
+        self._has_sent = True
         self._kept.append(sent)
         return sent
 

@@ -17,11 +17,24 @@ from typing import Any
 import zenoh
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import COORDINATOR, alive, key, replay, run_of, session, speaker_of, topic_of, watch
+from agent.contract.keys import (
+    BESIDE,
+    COORDINATOR,
+    alive,
+    key,
+    replay,
+    run_of,
+    sensor_who,
+    session,
+    speaker_of,
+    topic_of,
+    watch,
+)
 from agent.contract.messages import Stamp, Way
+from agent.guard import FORGED, UNREADABLE
 from agent.network.configuration import Network, zenoh_configuration
 from agent.network.outbox import Sent
-from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, Replayed, Sample
+from agent.network.words import ChannelClosed, Duty, Ignored, Incoming, Quota, Replayed, Sample
 from agent.plan import LARGEST_WINDOW
 
 # Zenoh's pools of threads as one. Else what arrives wakes a thread of the pool that has accepted the connection, that
@@ -30,6 +43,7 @@ from agent.plan import LARGEST_WINDOW
 ONE_POOL = "(tx:(handover:rx),net:(handover:rx),acc:(handover:rx),app:(handover:rx))"
 
 CAPACITY = 8 * LARGEST_WINDOW  # messages that a channel holds; a full one would hold up everything on its link
+MOST_ANSWERS = 1 << 16  # to one question, that wait; what is left out is asked for again
 BLOCK = zenoh.CongestionControl.BLOCK  # the default drops without a word
 TRACED = zenoh.TimestampInstrumentationBuilder().set_send(True).set_route(True).build()  # 1 µs a message
 DROP = zenoh.CongestionControl.DROP  # what viewers get: one that stands still must hold up nobody
@@ -42,7 +56,7 @@ class Channel:
     """
 
     def __init__(self, topic: str, handler: Any) -> None:
-        self._topic, self._handler = topic, handler
+        self.topic, self._handler = topic, handler
 
     def next(self) -> Sample:
         """The next message; blocks until there is one. Raises ChannelClosed."""
@@ -50,12 +64,12 @@ class Channel:
             sample = self._handler.recv()
         except zenoh.ZError:
             raise ChannelClosed from None
-        return _sample(self._topic or topic_of(str(sample.key_expr)).removeprefix(watch("")), sample)
+        return _sample(self.topic or topic_of(str(sample.key_expr)).removeprefix(watch("")), sample)
 
-    def waiting(self) -> Iterator[Sample]:
-        """The messages that are there already; does not block."""
-        while (sample := self._handler.try_recv()) is not None:
-            yield _sample(self._topic, sample)
+    def take(self) -> Sample | None:
+        """A message that is there already; does not block."""
+        sample = self._handler.try_recv()
+        return None if sample is None else _sample(self.topic, sample)
 
 
 class Session:
@@ -113,31 +127,49 @@ class Session:
         if self._watched[sent.topic]:
             self._shown[sent.topic].put(sent.payload)
 
-    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]]) -> None:
-        """Answer requests for the messages of `who` from a number on."""
+    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str], bool]) -> None:
+        """Answer requests for the messages of `who` from a number on, of a session that they are for."""
+        quota = Quota(CAPACITY)
 
-        def answer(query: zenoh.Query) -> None:
-            first = query.parameters.get("from") or ""
+        def answer(query: zenoh.Query) -> Ignored | None:
+            quota.leave()
+            first, by = (query.parameters.get(name) or "" for name in ("from", "by"))
             with query:
-                if not first.isdecimal() or "_anyke" not in query.parameters:
-                    return  # not the recorder's question
+                is_number = first.isdecimal() and first.isascii() and len(first) < 20
+                if not (is_number and "_anyke" in query.parameters and is_for(by)):
+                    return Ignored()  # not the recorder's question
                 for sent in since(int(first)):
                     query.reply(key(self._run, sent.topic, who=who), sent.payload, attachment=sent.stamp.encode())
+                return None
 
-        self._declared.append(
-            self._zenoh.declare_queryable(
-                key(self._run, replay(who)), lambda query: self._hand_over(lambda: answer(query))
-            )
-        )
+        def hear(query: zenoh.Query) -> None:
+            if quota.enter():
+                self._hand_over(lambda: answer(query))
+            else:
+                query.drop()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
+
+        self._declared.append(self._zenoh.declare_queryable(key(self._run, replay(who)), hear))
 
     def request_replay(self, who: str, *, first: int, seconds: float) -> None:
         """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
 
+        quota = Quota(MOST_ANSWERS)
+
+        def answered(reply: zenoh.Reply) -> Incoming:
+            quota.leave()
+            sample = reply.ok
+            topic = "" if sample is None else str(sample.key_expr)
+            if sample is None or not topic.startswith(key(self._run, "")):
+                return Ignored()
+            return _sample(topic_of(topic), sample)
+
         def hear(reply: zenoh.Reply) -> None:
-            self._hand_over(lambda: _replayed(reply))
+            if quota.enter():
+                self._hand_over(lambda: answered(reply))
 
         self._zenoh.get(
-            f"{key(self._run, replay(who))}?from={first};_anyke",  # answers come under their own keys
+            # answers come under their own keys
+            f"{key(self._run, replay(who))}?from={first};by={self.identity};_anyke",
             zenoh.handlers.Callback(hear, lambda: self._hand_over(lambda: Replayed(who))),
             consolidation=zenoh.ConsolidationMode.NONE,  # the default keeps one reply for each key
             timeout=seconds,
@@ -146,13 +178,21 @@ class Session:
     def answer(self, topic: str, payload: bytes) -> None:
         """Answer whoever asks on `topic` with these bytes, from now on."""
 
-        def reply(query: zenoh.Query) -> None:
+        quota = Quota(CAPACITY)
+
+        def reply(query: zenoh.Query) -> Ignored:
+            quota.leave()
             with query:
                 query.reply(key(self._run, topic), payload)
+            return Ignored()
 
-        self._declared.append(
-            self._zenoh.declare_queryable(key(self._run, topic), lambda query: self._hand_over(lambda: reply(query)))
-        )
+        def hear(query: zenoh.Query) -> None:
+            if quota.enter():
+                self._hand_over(lambda: reply(query))
+            else:
+                query.drop()  # type: ignore[no-untyped-call]  # zenoh leaves it untyped
+
+        self._declared.append(self._zenoh.declare_queryable(key(self._run, topic), hear))
 
     def ask(self, topic: str, decode: Callable[[bytes], Incoming | None], *, seconds: float) -> None:
         """Have whatever is answered on `topic` decoded."""
@@ -174,11 +214,20 @@ class Session:
         self._declared.append(liveliness.declare_subscriber(key("*", alive(COORDINATOR)), see, history=True))
 
     # Words that run the run.
-    def listen(self, topic: str, decode: Callable[[bytes], Incoming | None]) -> None:
-        """Have every word on `topic` decoded."""
+    def listen(self, topic: str, decode: Callable[[bytes], Incoming | None], *, overflow: Callable[[], None]) -> None:
+        """Have every word on `topic` decoded; `overflow` is told of each for which there is no room."""
+        quota = Quota(CAPACITY)
+
+        def decoded(payload: bytes) -> Incoming | None:
+            quota.leave()
+            return decode(payload)
 
         def hear(sample: zenoh.Sample) -> None:
-            self._hand_over(lambda: decode(sample.payload.to_bytes()))
+            payload = sample.payload.to_bytes()
+            if quota.enter():
+                self._hand_over(lambda: decoded(payload))
+            else:
+                overflow()
 
         self._declared.append(self._zenoh.declare_subscriber(key(self._run, topic), hear))
 
@@ -192,26 +241,23 @@ class Session:
         if len(payload) > self._largest:
             raise RunBroken(f"a message on {topic} has {len(payload)} bytes; others take {self._largest} at most")
 
-    def watch(self) -> None:
-        """Hear of everybody who is there, who comes and who goes, as Peer."""
+    def watch(self, see: Callable[[str, str, bool], None]) -> None:
+        """Hear of everybody who comes and goes: name, session ("" of a sensor), and whether it is there now.
 
-        def see(sample: zenoh.Sample) -> None:
-            who = topic_of(str(sample.key_expr)).removeprefix(alive(""))
-            self._hand_over(lambda: Peer(who, sample.kind == zenoh.SampleKind.PUT))
+        `see` is called on zenoh's thread, before anything that the session sends afterwards has come in.
+        """
 
-        liveliness = self._zenoh.liveliness()
-        self._declared.append(liveliness.declare_subscriber(key(self._run, alive("*")), see, history=True))
-
-    def watch_namesakes(self, who: str) -> None:
-        """Hear of every session of `who`, as Namesake."""
-
-        def see(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                identity = str(sample.key_expr).rpartition("/")[2]
-                self._hand_over(lambda: Namesake(identity))
+        def hear(sample: zenoh.Sample) -> None:
+            _, who, *identity = topic_of(str(sample.key_expr)).split("/")
+            see(who, "".join(identity), sample.kind == zenoh.SampleKind.PUT)
 
         liveliness = self._zenoh.liveliness()
-        self._declared.append(liveliness.declare_subscriber(key(self._run, session(who, "*")), see, history=True))
+        for topic in (session("*", "*"), alive(sensor_who("$*"))):
+            self._declared.append(
+                liveliness.declare_subscriber(
+                    key(self._run, topic), zenoh.handlers.Callback(hear, indirect=False), history=True
+                )
+            )
 
     def appear(self, who: str) -> None:
         """Show the tokens of `who`, until this session is closed or its process ends."""
@@ -238,14 +284,15 @@ class Session:
 
 
 def _sample(topic: str, sample: zenoh.Sample) -> Sample:
-    attachment = sample.attachment
-    try:
-        stamp = Stamp.decode(attachment.to_bytes()) if attachment is not None else None
-    except ValueError as error:
-        raise RunBroken(f"a message on {topic} has no readable stamp: {error}") from None
-    if stamp is not None and (speaker := speaker_of(str(sample.key_expr))) not in ("", stamp.sender):
-        raise RunBroken(f"a message on {topic} from {speaker} says that it is from {stamp.sender}")
-    return Sample(topic, sample.payload.to_bytes(), stamp, sample.timestamp_stack)
+    attachment, stamp, flaw = sample.attachment, None, ""
+    if attachment is not None:
+        try:
+            stamp = Stamp.decode(attachment.to_bytes())
+        except ValueError:
+            flaw = UNREADABLE
+    if topic in BESIDE and stamp is not None and stamp.sender != speaker_of(str(sample.key_expr)):
+        flaw = FORGED
+    return Sample(topic, sample.payload.to_bytes(), stamp, flaw, sample.timestamp_stack)
 
 
 def way_of(trace: Any, at: float) -> Way | None:
@@ -262,13 +309,6 @@ def way_of(trace: Any, at: float) -> Way | None:
 def _seconds(record: zenoh.TimestampStackRecord) -> float:
     stamp = record.timestamp()
     return stamp.get_time().timestamp() if isinstance(stamp, zenoh.Timestamp) else math.nan
-
-
-def _replayed(reply: zenoh.Reply) -> Sample | None:
-    sample = reply.ok
-    if sample is None or str(sample.key_expr).count("/") < 2:  # anybody may answer, under any key
-        return None
-    return _sample(topic_of(str(sample.key_expr)), sample)
 
 
 @contextmanager

@@ -8,15 +8,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 
 from agent.contract.errors import InputError
-from agent.contract.messages import Acknowledged, Control, Facts, Joining, Leaving, Ready, Stamp
+from agent.contract.messages import Acknowledged, Control, Facts, Joining, Leaving, Ready, Refusals, Stamp
 
 
 class Sample(NamedTuple):
-    """A data message as it came in. `stamp` is None where the sender left it out.
+    """A data message as it came in. `stamp` is None where the sender left it out; `flaw` is a kind of agent.guard.
 
     `trace` is Zenoh's record of when it was where; see `session.way_of`.
     """
@@ -24,6 +25,7 @@ class Sample(NamedTuple):
     topic: str
     payload: bytes
     stamp: Stamp | None
+    flaw: str = ""
     trace: Any = None
 
 
@@ -46,7 +48,41 @@ class Replayed(NamedTuple):
     who: str
 
 
-Incoming = Sample | Peer | Namesake | Control | Acknowledged | Joining | Leaving | Ready | Replayed | Facts
+class Ignored(NamedTuple):
+    """A word that was refused: as if nothing had come."""
+
+
+class Quota:
+    """How much of one origin may wait; one thread lets in, another lets out."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._in, self._out = most, 0, 0
+
+    def enter(self) -> bool:
+        """False where there is no room."""
+        if self._in - self._out >= self._most:
+            return False
+        self._in += 1
+        return True
+
+    def leave(self) -> None:
+        self._out += 1
+
+
+Incoming = (
+    Sample
+    | Peer
+    | Namesake
+    | Control
+    | Acknowledged
+    | Joining
+    | Leaving
+    | Ready
+    | Refusals
+    | Replayed
+    | Facts
+    | Ignored
+)
 Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
 T = TypeVar("T")
 
@@ -86,7 +122,9 @@ class ChannelClosed(Exception):
 class Words:
     """The main thread's queue. Any thread may `put`; the main thread alone takes, so that failures end the process."""
 
-    def __init__(self, who: str) -> None:
+    def __init__(self, who: str, *, meanwhile: Callable[[], float] = lambda: math.inf) -> None:
+        """`meanwhile` is done while nothing comes; it says when to do it again, on time.monotonic()."""
+        self._meanwhile = meanwhile
         self.present: set[str] = set()  # whose token is there
         self.reasons: dict[str, str] = {}  # why those have gone who have said so
         self.alone = True  # nobody else of this run has been heard
@@ -98,17 +136,23 @@ class Words:
     def put(self, duty: Duty) -> None:
         self._queue.put(duty)
 
+    def see(self, who: str, identity: str, present: bool) -> None:
+        """Somebody has come or gone; whoever only looks on believes it as it is."""
+        self.put(lambda: Peer(who, present))
+
     def next(self, deadline: float) -> Incoming | None:
         """The next word, what was set aside first; None as from `take`."""
         return self._early.pop(0) if self._early else self.take(deadline)
 
     def take(self, deadline: float) -> Incoming | None:
         """The next word; None at the deadline, or where a duty was done without one. Raises what a duty does."""
-        left = deadline - time.monotonic()
-        try:
-            word = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
-        except Empty:
-            return None
+        word: Incoming | None = Ignored()
+        while isinstance(word, Ignored):
+            left = min(deadline, self._meanwhile()) - time.monotonic()
+            with suppress(Empty):
+                word = self._queue.get(timeout=None if left == math.inf else max(0.0, left))()
+            if isinstance(word, Ignored) and time.monotonic() >= deadline:
+                return None
         self.taken += 1
         is_own = isinstance(word, Namesake) or (isinstance(word, Peer) and word.who == self._who)
         if word is not None and not is_own:

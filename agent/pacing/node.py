@@ -29,6 +29,7 @@ from agent.pacing.spread import Spread
 from agent.plan import LARGEST_WINDOW, Pace
 
 TELL_STEPS, TELL_SECONDS = 30, 1.0  # after both, a node tells how it goes, again and again
+EARLY_PART = 0.25  # of a period: by so much the messages of a step may come before its tick
 PATIENCE = 1.0  # seconds, after which a message that is waited for no more counts as silent
 
 
@@ -70,6 +71,7 @@ class PacedNode:
         self._to_estimate, self._to_step = Spread(), Spread()
         self._made = self._pairs = self._pairs_missed = self._measurements_missed = self._late = 0
         self._told_at: tuple[int, float] | None = None  # steps made, and when: of its last account, or the beginning
+        self._refused: dict[str, float] = {}  # of a topic, when something of it was refused
         self.done = False
 
     def take(self, sender: str, message: Message, at: float, way: Callable[[], Way | None] = lambda: None) -> None:
@@ -77,7 +79,7 @@ class PacedNode:
         arrived = _Arrived(sender, message, at, way)
         if isinstance(message, Mode):
             self._told_at = self._told_at or (0, at)
-            if self._k <= message.step < self._steps:
+            if self._k <= message.step < self._steps and len(self._ticks) < LARGEST_WINDOW:
                 self._ticks.setdefault(message.step, arrived)
             return
         topic = self._measurement if isinstance(message, Measurement) else estimate(sender)
@@ -86,6 +88,11 @@ class PacedNode:
             self._late += self._reasons.came(message.step, topic, at, way)
         elif message.step < self._k + LARGEST_WINDOW:
             self._there[message.step].setdefault(topic, arrived)
+
+    def refused(self, topic: str, at: float) -> None:
+        """A message that its sender has sent did not fit. What is not there of this topic is not there for that."""
+        self._refused[topic] = at
+        self._reasons.refused(topic, at)
 
     @property
     def wake(self) -> float:
@@ -160,7 +167,9 @@ class PacedNode:
             self._inbox.put(arrived.sender, arrived.message)
             return True
         is_gone = arrived is None and not self._is_there(topic)
-        self._reasons.missed(self._k, topic, deadline=deadline, gone=is_gone)
+        since = self._ticks[self._k].at - EARLY_PART * self._pace.period
+        is_refused = arrived is None and since <= self._refused.get(topic, -math.inf)
+        self._reasons.missed(self._k, topic, deadline=deadline, gone=is_gone, refused=is_refused)
         if arrived is not None:
             self._late += self._reasons.came(self._k, topic, arrived.at, arrived.way)
         return False

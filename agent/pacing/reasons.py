@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from agent.contract.messages import GONE, LATE, SILENT, Event, Way
+from agent.contract.messages import GONE, LATE, REFUSED, SILENT, Event, Way
 
 TELL_SECONDS = 0.5  # a reason waits for others to go with it for so long
 AT_MOST = 64  # reasons in one event
@@ -38,10 +38,10 @@ class Reasons:
         self._open: dict[_Missed, float] = {}  # its deadline; in the order of the steps
         self._told: dict[tuple[str, str], _Told] = {}
 
-    def missed(self, step: int, topic: str, *, deadline: float, gone: bool) -> None:
-        """A message was substituted; `gone`: nobody is there who could have sent it."""
-        if gone:
-            self._tell(GONE, topic, step, 0.0, deadline)
+    def missed(self, step: int, topic: str, *, deadline: float, gone: bool, refused: bool = False) -> None:
+        """A message was substituted; `gone`: nobody is there who could have sent it; `refused`: one came, unfit."""
+        if gone or refused:
+            self._tell(REFUSED if refused else GONE, topic, step, 0.0, deadline)
         else:
             self._open[_Missed(step, topic)] = deadline
 
@@ -52,6 +52,13 @@ class Reasons:
             return False
         self._tell(LATE, topic, step, at - deadline, at, way())
         return True
+
+    def refused(self, topic: str, at: float) -> None:
+        """A message came that did not fit: the first that is waited for of its topic, as far as anybody can tell."""
+        missed = next((missed for missed in self._open if missed.topic == topic), None)
+        if missed is not None:
+            del self._open[missed]
+            self._tell(REFUSED, topic, missed.step, 0.0, at)
 
     @property
     def due(self) -> float:

@@ -14,24 +14,38 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
-from agent.contract.errors import InputError, PeakmeshError, RecordingFailed, RunBroken
+from agent.contract.errors import InputError, PeakmeshError, RecordingFailed, RunBroken, counted
 from agent.contract.gains import Gains
 from agent.contract.keys import (
+    ACKNOWLEDGED,
     COORDINATOR,
     EVENT,
     MODE,
     PLANT,
     RECORDER,
+    data_topics,
     in_words,
     participants,
     sensor_who,
 )
-from agent.contract.messages import GONE, Acknowledged, BrokenOff, Control, Event, Mode, Ready
+from agent.contract.messages import (
+    GONE,
+    REFUSED,
+    Acknowledged,
+    BrokenOff,
+    Control,
+    Event,
+    Mode,
+    Ready,
+    Refusals,
+)
 from agent.contract.schedule import modes
+from agent.guard import UNTIMELY, Counts
 from agent.network.acquaintance import stray_sensor
 from agent.network.bus import Bus
 from agent.network.words import Incoming, Orphaned, Peer, Refused
 from agent.plan import Plan
+from agent.refusals import Register
 from agent.roles.timekeeper import Timekeeper
 
 REPORT_SECONDS = 0.1
@@ -48,6 +62,7 @@ class Summary(NamedTuple):
     recorded_steps: int  # all, unless the recording broke off
     broken_off: str  # why, and since when there is no recording; "" where there is a whole one
     pacing: dict[str, Any] | None = None  # of a paced run: what was substituted, and latencies in seconds
+    refused: dict[str, Counts] | None = None  # messages that did not fit: by whom, on which topic, of which kind
 
 
 # what the coordinator reports: {"joined": who}, {"started": time}, {"complete": steps}, {"broken_off": sentence},
@@ -70,6 +85,7 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
     Raises RunBroken where somebody was lost, a deadline has passed or the recorder has the run stop, Interrupted on a
     signal; in all cases the others have been told, and the recorder has closed the recording.
     """
+    bus.guard.know(gains.problem)
     bus.advertise([MODE, EVENT])
     conductor, timekeeper = Conductor(bus, gains, plan, report), None
     if plan.pace is not None:
@@ -94,6 +110,7 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
             raise RunBroken(f"{error}; {conductor.complete} steps were complete") from None
         raise
     last_word = conductor.close()
+    conductor.doubt(last_word)
     off = last_word.broken_off
     return Summary(
         steps=plan.steps,
@@ -103,6 +120,7 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
         recorded_steps=plan.steps if off is None else off.steps,
         broken_off="" if off is None else str(off),
         pacing=None if timekeeper is None else timekeeper.pacing(),
+        refused=conductor.refused(),
     )
 
 
@@ -116,8 +134,10 @@ class Conductor:
         self.complete = 0  # steps that the recorder has
         self._broken_off: BrokenOff | None = None
         self._lacking: list[str] = []
+        self._given = 0  # steps whose modes are out, in lock-step
         self._started = False
         self._identity = os.urandom(8).hex()
+        self._register = Register()  # of what was refused
         self._recorded = 0  # steps whose modes the recorder has, in a paced run that is taken up again
         if plan.needs_no_plant(gains.problem):
             self._everybody.remove(PLANT)
@@ -125,6 +145,7 @@ class Conductor:
     def start(self) -> None:
         """The barrier, and the order to start; a paced run that has lost its coordinator is taken up where it is."""
         self._bus.enter()
+        self._bus.guard.begin(steps=self._plan.steps, external=self._plan.external, paced=self._plan.pace is not None)
         try:
             self._gather()
         except Orphaned as run:
@@ -176,7 +197,7 @@ class Conductor:
         for step in range(self._plan.steps):
             while step >= self.complete + self._plan.window:
                 self._wait_for_progress()
-            index = next(chain)
+            index, self._given = next(chain), step + 1
             self._bus.publish(MODE, Mode(step=step, mode=names[index], index=index))
         while self.complete < self._plan.steps:
             self._wait_for_progress()
@@ -186,6 +207,7 @@ class Conductor:
 
         def tick(step: int) -> None:
             self.complete = step + 1
+            self._tell_refused()
             self._report_progress()
 
         timekeeper.keep_time(tick, first=self.complete, recorded=self._recorded)
@@ -195,6 +217,8 @@ class Conductor:
         match word:
             case Acknowledged() as acknowledged:
                 self._heed(acknowledged.broken_off)
+            case Refusals():
+                self._note(word)
             case Peer(who=who, present=present) if self._takes_part(who):
                 self._announce("back" if present else GONE, in_words(who), about=who)
                 self._welcome(word)
@@ -206,6 +230,12 @@ class Conductor:
         if doubt := stray_sensor(who):
             self._report({"warning": doubt})
 
+    def _note(self, word: Incoming | None) -> None:
+        """What somebody has refused."""
+        match word:
+            case Refusals(who=who, counts=counts):
+                self._register.enter(who, counts)
+
     def stood(self, seconds: float) -> None:
         """The clock of a paced run stood still."""
         self._announce("stood", f"the clock of the run stood still for {seconds:.3g} s before step {self.complete}")
@@ -213,9 +243,10 @@ class Conductor:
     def close(self) -> Acknowledged:
         """All is done: the recorder closes the recording, then everybody leaves."""
         self._report({"ending": ""})
+        self._tell_refused(hurry=True)
         self._announce("end", "all steps are done")
         self._order("close")
-        last_word = self._bus.wait_for_close()
+        last_word = self._bus.wait_for_close(self._note)
         if last_word is None:
             raise RunBroken("all steps are done, but the recorder did not close the recording")
         return last_word
@@ -224,10 +255,11 @@ class Conductor:
         """Tell everybody why the run ends here, and wait for the recorder where there is something to close."""
         self._report({"ending": reason})
         if self._started:
+            self._tell_refused(hurry=True)
             self._announce("stop", reason)
         self._order("stop", reason)
         if self._started:
-            return self._bus.wait_for_close()
+            return self._bus.wait_for_close(self._note)
         self._bus.wait_until_gone(self._everybody, greet=lambda: self._order("stop", reason))
         return None
 
@@ -265,20 +297,49 @@ class Conductor:
             if left <= 0.0:
                 raise RunBroken(self._what_is_late(silent))
             match self._bus.receive(timeout=left):
-                case Acknowledged() as acknowledged:
+                case Acknowledged() as acknowledged if before <= acknowledged.steps <= self._given:
                     self.complete, self._lacking = acknowledged.steps, acknowledged.lacking
                     silent = False
                     self._heed(acknowledged.broken_off)
+                case Acknowledged():  # what was not given out, nobody can have
+                    self._bus.guard.refuse(ACKNOWLEDGED, UNTIMELY)
+                case Refusals() as refusals:
+                    self._note(refusals)
                 case Peer(who=who, present=False) if self._takes_part(who):
                     raise Lost(who, self._bus.reason_of(who))
                 case Peer(who=who, present=True) if not self._takes_part(who):
                     self._doubt(who)
+            self._tell_refused()
         self._report_progress()
 
     def _report_progress(self) -> None:
         if time.monotonic() - self._reported >= REPORT_SECONDS:
             self._reported = time.monotonic()
             self._report({"complete": self.complete})
+
+    def doubt(self, last_word: Acknowledged) -> None:
+        """RunBroken where the recorder has closed another recording than that of all that was said, in lock-step."""
+        if last_word.broken_off is not None or self._plan.pace is not None:
+            return
+        least = self._plan.steps * len(data_topics(self._gains.problem))
+        own, of_own = self._bus.published, last_word.received.get(COORDINATOR, 0)
+        if last_word.steps != self._plan.steps or last_word.messages < least or of_own != own:
+            raise RunBroken(
+                f"the recorder has closed a recording of {last_word.steps} steps and "
+                f"{counted(last_word.messages, 'message')}, {of_own} of the coordinator's; there were "
+                f"{self._plan.steps} steps and at least {least} messages, {own} of the coordinator's"
+            )
+
+    def refused(self) -> dict[str, Counts] | None:
+        """What everybody has refused; None where that is nothing."""
+        return self._register.document() or None
+
+    def _tell_refused(self, *, hurry: bool = False) -> None:
+        """Say what was refused, now and then."""
+        if self._bus.guard.total:
+            self._register.enter(COORDINATOR, self._bus.guard.refused())
+        for refused in self._register.due(time.monotonic(), hurry=hurry):
+            self._announce(REFUSED, refused.text, about=refused.topic)
 
     def _heed(self, broken_off: BrokenOff | None) -> None:
         """What the recorder says of its recording: stop where it asks for that, else tell everybody, once."""

@@ -20,9 +20,11 @@ def join(bus: Bus, gains: Gains) -> Control:
 
     A paced run that has begun without us is joined where it is. InputError where it is one of other gains.
     """
+    bus.guard.know(gains.problem)
     bus.enter()
     try:
         start = _met(bus, gains)
+        bus.guard.begin(steps=start.steps, external=tuple(start.external), paced=start.period > 0.0)
         bus.has_begun, bus.is_late = True, start.step > 0
         bus.patient, bus.identity = start.period > 0.0, start.identity
         if start.step and bus.who != RECORDER:

@@ -10,18 +10,17 @@ from itertools import count
 
 import numpy as np
 
-from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains, NodeGains
-from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT, decode, estimate, measurement, node_who, sensor_who
+from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT, estimate, measurement, node_who, sensor_who
 from agent.contract.messages import Account, Control, Estimate, Message, Mode, Way
 from agent.contract.schedule import Deliveries
 from agent.estimates import told
 from agent.faults import Arriving, Ordeal, parse
 from agent.filter import Pair, innovation, step
 from agent.inbox import Inbox
-from agent.network.arrivals import Arrival, Arrivals
+from agent.network.arrivals import Arrivals, way
 from agent.network.bus import Bus
-from agent.network.session import Channel
+from agent.network.gate import Admitted, Arrived, Gate
 from agent.network.words import Sample
 from agent.pacing.node import PacedNode
 from agent.plan import Pace
@@ -62,7 +61,11 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         arriving = Arriving(faults, problem, node, seed=start.seed)
         ordeal = Ordeal(faults, node_who(node), begin=start.step)
-        arrivals = Arrivals([modes, measurements, *estimates.values()], in_thread=bus.in_thread)
+        arrivals = Arrivals(
+            [gate.arrived for gate in (modes, measurements, *estimates.values())],
+            in_thread=bus.in_thread,
+            overflow=lambda arrived: arrived.gate.overflow(),
+        )
         _against_the_clock(bus, paced, arrivals, node, arriving=arriving, ordeal=ordeal)
 
     take_part(bus, gains, work)
@@ -72,14 +75,15 @@ def _in_lock_step(
     bus: Bus,
     own: NodeGains,
     lost: Callable[[int], set[str]],
-    modes: Channel,
-    measurements: Channel,
-    estimates: Mapping[str, Channel],
+    modes: Gate,
+    measurements: Gate,
+    estimates: Mapping[str, Gate],
 ) -> None:
     """Step after step, each once everything is there, until a channel closes."""
     inbox, x_hat = Inbox(own), np.zeros(own.M.shape[1])
     mode, heard = "", list[str]()  # what made x_hat
     for k in count():
+        bus.guard.now = k
         while inbox.y is None:
             _put(inbox, measurements.next())
         sent = told(own, k, Pair(x_hat, innovation(own, inbox.y, x_hat)), mode=mode, heard=heard)
@@ -93,37 +97,38 @@ def _in_lock_step(
         x_hat, heard = step(own, mode, pairs), list(pairs)
         inbox.next_step()
         for sender in estimates.keys() - set(heard):  # whose message was not needed must not pile up
-            for sample in estimates[sender].waiting():
-                _put(inbox, sample)
+            for admitted in estimates[sender].waiting():
+                _put(inbox, admitted)
 
 
 def _against_the_clock(
-    bus: Bus, paced: PacedNode, arrivals: Arrivals, node: str, *, arriving: Arriving, ordeal: Ordeal
+    bus: Bus, paced: PacedNode, arrivals: Arrivals[Arrived], node: str, *, arriving: Arriving, ordeal: Ordeal
 ) -> None:
     """Steps as they are due, until all are made or a channel closes."""
     while not paced.done:
-        for arrival in arrivals.until(paced.wake):
-            sender, message = _decoded(arrival.sample)
-            delay = arriving.delay(arrival.sample.topic, message.step)
+        for (gate, sample), at in arrivals.until(paced.wake):
+            topic, admitted = gate.topic, gate.open(sample)
+            if admitted is None:
+                paced.refused(topic, at)
+                continue
+            sender, message = _sender(topic), admitted.message
+            delay = arriving.delay(topic, message.step)
             if delay < math.inf:
-                paced.take(sender, message, arrival.at + delay, partial(_way, arrival, delay))
+                paced.take(sender, message, at + delay, partial(_way, sample, at, delay))
             if isinstance(message, Mode):
                 suffer(ordeal.due(message.step))
                 bus.step = max(bus.step, message.step + 1)
-        try:
-            for message in paced.advance(time.monotonic()):
-                if isinstance(message, Account):
-                    message = message.model_copy(update={"processor": time.process_time()})
-                bus.publish(_topic_of(message, node), message)
-                paced.published(message, time.monotonic())
-        except ValueError as error:
-            raise RunBroken(f"a message to node {node} cannot be used: {error}") from None
+        for message in paced.advance(time.monotonic()):
+            if isinstance(message, Account):
+                message = message.model_copy(update={"processor": time.process_time()})
+            bus.publish(_topic_of(message, node), message)
+            paced.published(message, time.monotonic())
 
 
-def _way(arrival: Arrival, delay: float) -> Way | None:
-    """Where a message spent its time; a delay that a fault asks for is one of the wire."""
-    way = arrival.way()
-    return None if way is None else way._replace(wire=way.wire + delay)
+def _way(sample: Sample, at: float, delay: float) -> Way | None:
+    """Where a message that arrived `at` spent its time; a delay that a fault asks for is one of the wire."""
+    found = way(sample, at)
+    return None if found is None else found._replace(wire=found.wire + delay)
 
 
 def _topic_of(message: Message, node: str) -> str:
@@ -139,13 +144,10 @@ def _node_of(topic: str) -> str:
     return node_who(topic.split("/")[1])
 
 
-def _decoded(sample: Sample) -> tuple[str, Message]:
-    """The node that a message is from, "" for the mode, and the message."""
-    return sample.topic.split("/")[1] if sample.topic != MODE else "", decode(sample.topic, sample.payload)
+def _sender(topic: str) -> str:
+    """The node that a message is from or for, "" for the mode."""
+    return topic.split("/")[1] if topic != MODE else ""
 
 
-def _put(inbox: Inbox, sample: Sample) -> None:
-    try:
-        inbox.put(*_decoded(sample))
-    except ValueError as error:
-        raise RunBroken(f"a message on {sample.topic} cannot be used: {error}") from None
+def _put(inbox: Inbox, admitted: Admitted) -> None:
+    inbox.put(_sender(admitted.topic), admitted.message)

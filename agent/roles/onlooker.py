@@ -21,7 +21,7 @@ from agent.contract.messages import Facts
 from agent.network.arrivals import Arrival, Arrivals
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
-from agent.network.words import Words
+from agent.network.words import Sample, Words
 from agent.signals import heed, restore
 
 ASK_SECONDS = 1.0  # what is not answered by then is asked again
@@ -35,10 +35,10 @@ class Onlooker:
         self.run = run
         self.facts: Facts | None = None  # what run this is, as soon as somebody has answered
         self._session, self._words = session, words
-        self._arrivals = Arrivals([heard])
+        self._arrivals = Arrivals([heard.next])
         self._asked = -ASK_SECONDS
 
-    def until(self, deadline: float) -> Iterator[Arrival]:
+    def until(self, deadline: float) -> Iterator[Arrival[Sample]]:
         """What was published, with the time at which it arrived here; ends at the deadline, by time.monotonic()."""
         while time.monotonic() < deadline:
             yield from self._arrivals.until(deadline)
@@ -73,7 +73,7 @@ def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
         words = Words("")
         with closing(Session(network, run=name, who=VIEWER, hand_over=words.put)) as session:
             heard = session.overhear()
-            session.watch()
+            session.watch(words.see)
             wait_for_coordinator(words, name, network.wait)
             onlooker = Onlooker(session, words, heard, name)
             onlooker.heed()

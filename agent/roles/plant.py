@@ -8,12 +8,13 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import MODE, PLANT, PLANT_STATE, decode, measurement
+from agent.contract.keys import MODE, PLANT, PLANT_STATE, measurement
 from agent.contract.messages import Control, Measurement, PlantState
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses
 from agent.faults import Ordeal, parse
+from agent.guard import UNTIMELY
 from agent.network.bus import Bus
 from agent.product import product
 from agent.roles.joining import take_part
@@ -34,7 +35,10 @@ def run(bus: Bus, gains: Gains) -> None:
         if start.period:
             bus.trace()
         while True:
-            step = first = decode(MODE, modes.next().payload).step
+            step = first = modes.next().message.step
+            if not start.period and step != plant.step:
+                bus.guard.refuse(MODE, UNTIMELY)
+                continue
             if start.period:
                 if step < plant.step:
                     continue  # a coordinator that has come back gives out again what the recorder has not got

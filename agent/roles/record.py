@@ -17,7 +17,6 @@ from agent.contract.recording import Logged
 from agent.contract.recording.evidence.chains import Chains
 from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import RecordingWriter, Split
-from agent.network.words import Sample
 from agent.receipts import Receipts
 
 
@@ -83,7 +82,7 @@ class Record:
         sender = sender if sender.startswith("node-") else sender_of(logged.topic)
         digest = digest_of(logged.topic, logged.payload)
         stamp = Stamp(logged.number, logged.publish_time, sender, digest)
-        self.take(Sample(logged.topic, logged.payload, stamp), message.step, at=logged.log_time)
+        self.take(logged.topic, logged.payload, stamp, message.step, at=logged.log_time)
 
     def flush(self) -> None:
         """Have the file hold all that came: who is told that it was received keeps it no longer."""
@@ -91,13 +90,12 @@ class Record:
             with self._failing():
                 self._writer.flush()
 
-    def take(self, sample: Sample, step: int, *, at: int | None = None) -> bool:
+    def take(self, topic: str, payload: bytes, stamp: Stamp | None, step: int, *, at: int | None = None) -> bool:
         """Take in a message that came `at`, or now; False where it was there already.
 
         Raises RunBroken for what cannot be recorded.
         """
-        stamp = sample.stamp
-        if not self.receipts.take(sample.topic, step, stamp):
+        if not self.receipts.take(topic, step, stamp):
             return False
         if self._writer is None:
             if stamp is not None and not self.failure:  # it stands in a part that is whole
@@ -106,7 +104,7 @@ class Record:
         now = time.time_ns() if at is None else at
         number, published = (stamp.number, stamp.time) if stamp is not None else (0, now)
         try:
-            self._writer.add(Logged(sample.topic, sample.payload, number, now, published))
+            self._writer.add(Logged(topic, payload, number, now, published))
             self._note_what_is_held()
             if stamp is not None and (evidence := self._chains.add(stamp, step)) is not None:
                 self._put(evidence)

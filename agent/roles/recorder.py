@@ -16,14 +16,16 @@ from pathlib import Path
 
 from agent.contract.errors import InputError, Interrupted, RecordingFailed, RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT_STATE, RECORDER, decode, estimate, measurement, sender_of
+from agent.contract.keys import ACCOUNT, EVENT, MODE, PLANT_STATE, RECORDER, estimate, measurement, sender_of
 from agent.contract.messages import Acknowledged, BrokenOff, Control, Facts, Ready
 from agent.contract.recording.parts import refuse_recording
 from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import Split
 from agent.faults import Ordeal, parse
+from agent.guard import REPLAY, UNASKED, Unfit
 from agent.network.bus import Bus
-from agent.network.session import Channel
+from agent.network.gate import MOST, Admitted, Gate, admit
+from agent.network.session import CAPACITY
 from agent.network.words import Peer, RunClosed, Sample
 from agent.plan import RecordingPlan
 from agent.roles.joining import join
@@ -94,7 +96,7 @@ class Recorder:
     def __init__(
         self,
         bus: Bus,
-        channels: Mapping[str, Channel],
+        channels: Mapping[str, Gate],
         record: Record,
         *,
         window: int,
@@ -112,7 +114,6 @@ class Recorder:
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._sessions: dict[str, str] = {}  # of those who are there: a namesake shall not go on with their numbers
         self._acknowledged = 0
-        self._closing = False
         self._quiet_since = time.monotonic()
         self.broken_off: BrokenOff | None = None
 
@@ -127,7 +128,7 @@ class Recorder:
             word = self._bus.receive(timeout=pause)
             match word:
                 case Sample():  # a replay that we asked for
-                    self._take(word)
+                    self._take_replayed(word)
                 case Ready(who=who, session=session, asks=asks) if who in self._publishers:
                     if self._sessions.setdefault(who, session) == session and asks:
                         self._greet(who)
@@ -139,26 +140,25 @@ class Recorder:
 
     def close(self, *, status: str, reason: str) -> None:
         """Ask everybody for what is missing, end the file, and let everybody go."""
-        self._closing = True
-        self._take_waiting()
+        self._take_waiting(most=2 * CAPACITY)
         if self._is_late:
             self._bus.wait_until_there(self._publishers)
         self._ask_everybody()
         for sample in self._bus.replayed(self._publishers):
-            self._take(sample)
-        self._take_waiting()  # what came meanwhile
+            self._take_replayed(sample)
+        self._take_waiting(most=2 * CAPACITY)  # what came meanwhile
         self._record.finish(status=status, reason=reason)
         self._heed_failure()
         self._acknowledge(closed=True)
         self._bus.wait_until_gone(self._publishers)
 
-    def _take_waiting(self) -> bool:
-        """Take what has come, acknowledging on the way; False where there was nothing."""
+    def _take_waiting(self, most: int = MOST) -> bool:
+        """Take what has come, `most` of each topic, acknowledging on the way; False where there was nothing."""
         receipts = self._record.receipts
         before = receipts.messages
-        for channel in self._channels.values():
-            for sample in channel.waiting():
-                self._take(sample)
+        for gate in self._channels.values():
+            for admitted in gate.waiting(most):
+                self._take(admitted)
         new_steps, new_messages = receipts.complete - self._acknowledged, receipts.messages - before
         if self._ordeal is not None:
             self._acknowledge_at_times()
@@ -173,18 +173,21 @@ class Recorder:
             self._record.flush()
             self._acknowledge()
 
-    def _take(self, sample: Sample) -> None:
+    def _take_replayed(self, sample: Sample) -> None:
+        """Take an answer to what we have asked for; anybody can answer anything."""
         try:
-            if sample.topic not in self._channels:  # the answer to a replay can say anything
-                raise RunBroken(f"there is no topic {sample.topic}")
-            step = decode(sample.topic, sample.payload).step
-        except RunBroken:
-            if self._closing:  # no foreign message shall keep the file from being closed
-                return
-            raise
-        if self._record.take(sample, step):
+            if sample.topic not in self._channels:
+                raise Unfit(UNASKED)
+            self._take(admit(self._bus.guard, sample, for_record=True))
+        except Unfit as unfit:
+            self._bus.guard.refuse(REPLAY, unfit.kind)
+
+    def _take(self, admitted: Admitted) -> None:
+        step = admitted.message.step
+        if self._record.take(admitted.topic, admitted.payload, admitted.stamp, step):
             self._quiet_since = time.monotonic()
-        if self._ordeal is not None and sample.topic == MODE:
+        self._bus.guard.now = self._record.receipts.complete
+        if self._ordeal is not None and admitted.topic == MODE:
             suffer(self._ordeal.due(step))
 
     def _heed_failure(self) -> None:

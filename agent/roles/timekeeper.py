@@ -105,6 +105,6 @@ class Timekeeper:
         return RECORDER in self._bus.present and there <= told
 
     def _hear_accounts(self) -> None:
-        for sample in self._telling.waiting():
-            account = Account.decode(sample.payload)
-            self._accounts[account.who] = account
+        for admitted in self._telling.waiting():
+            if isinstance(account := admitted.message, Account):
+                self._accounts[account.who] = account

@@ -32,7 +32,7 @@ def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: 
         overheard = session.overhear()
         with _server(gains, run, host, port) as (address, show):
             say(address)
-            session.watch()
+            session.watch(words.see)
             wait_for_coordinator(words, run, network.wait)
             threading.Thread(target=_pass_on, args=(overheard, show), daemon=True).start()
             while COORDINATOR in words.present:

@@ -1,4 +1,4 @@
-"""What happened in a recorded run, one by one: losses, substitutions, missing messages, divergences."""
+"""What happened in a recorded run, one by one: losses, substitutions, refusals, missing messages, divergences."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Happening(NamedTuple):
 
 def happenings(log: Log, divergences: list[Divergence], times: Times) -> Iterator[Happening]:
     """In the order of the steps; the divergences as they are given, by step."""
-    kinds = _losses(log, times), _substitutions(log, times), _missing(log, times), _divergences(divergences, times)
-    return heapq.merge(*kinds, key=lambda happening: happening.step)
+    kinds = [_losses(log, times), _substitutions(log, times), _refusals(log, times), _missing(log, times)]
+    return heapq.merge(*kinds, _divergences(divergences, times), key=lambda happening: happening.step)
 
 
 def _losses(log: Log, times: Times) -> Iterator[Happening]:
@@ -55,6 +55,13 @@ def _substitutions(log: Log, times: Times) -> Iterator[Happening]:
         receiver, sender = problem.node_names[i], problem.node_names[j]
         text = f'node "{receiver}" did not use the message of node "{sender}": its own estimate stood in for it'
         yield Happening("substitution", step, receiver, text, False, times.of(estimate(receiver), step + 1))
+
+
+def _refusals(log: Log, times: Times) -> Iterator[Happening]:
+    """Messages that did not fit, as the coordinator has told of them last."""
+    for event in sorted(log.said.refusals.values(), key=lambda event: event.step):
+        step = min(event.step, max(log.steps - 1, 0))
+        yield Happening("refusal", step, "", event.detail, False, int(times.steps[step]))
 
 
 def _missing(log: Log, times: Times) -> Iterator[Happening]:

@@ -165,7 +165,13 @@ def _log(
         end=reader.end,
         damage=_joined(damages),
         is_doubtful=reader.is_doubtful,
-        notes=(*reader.notes, *_strangers(reader, content.others), *census.notes, *evidence.unchecked),
+        notes=(
+            *reader.notes,
+            *_strangers(reader, content.others),
+            *census.notes,
+            *evidence.unchecked,
+            *content.refusals(),
+        ),
         finished=finished,
         gains=reader.gains,
         seed=seed,
@@ -285,6 +291,10 @@ class _Content:
         """A message that has a number and no row of its own."""
         self._events.append(logged.number)
         self._keys.append(hash((logged.publish_time, logged.payload)))
+
+    def refusals(self) -> list[str]:
+        """What did not fit while the run went on, in the words of its coordinator."""
+        return [event.detail for event in self.said.refusals.values()]
 
     def last(self) -> int:
         """The last step of which there is anything, -1 where there is nothing."""

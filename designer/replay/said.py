@@ -1,4 +1,4 @@
-"""What the events of a paced run say of messages that were not there in time, and of who was away."""
+"""What the events of a run say of messages that were refused, or not there in time, and of who was away."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from agent.contract.keys import PLANT, PLANT_STATE, estimate, measurement, node_who
-from agent.contract.messages import GONE, LATE, SILENT, Account, Event
+from agent.contract.messages import GONE, LATE, REFUSED, SILENT, Account, Event
 from designer.replay.central import Flags
 from designer.replay.topics import Columns, Numbers, Topic
 
@@ -29,6 +29,7 @@ class Said:
         self.gone: dict[str, list[int]] = {}  # of a participant, about when it went
         self.kinds: Counter[str] = Counter()  # why messages were substituted
         self.faults: list[str] = []  # that were injected
+        self.refusals: dict[tuple[str, str], Event] = {}  # of a topic, by whom: the last count of what did not fit
         self._nodes = {node_who(name): i for i, name in enumerate(node_names)}
         self._estimates = {estimate(name): i for i, name in enumerate(node_names)}
         self._measurements = {measurement(name): i for i, name in enumerate(node_names)}
@@ -54,7 +55,9 @@ class Said:
             self.gone.setdefault(event.about, []).append(event.step)
         elif i is not None and event.kind == "began":
             self.began |= {(step, i) for step in event.steps}
-        elif i is not None and event.kind in (LATE, SILENT, GONE):
+        elif i is None and event.kind == REFUSED:
+            self.refusals[event.about, event.detail.partition(" has refused ")[0]] = event
+        elif i is not None and event.kind in (LATE, SILENT, GONE, REFUSED):
             self.kinds[event.kind] += len(event.steps)
             j = self._estimates.get(event.about)
             if j is not None:

@@ -17,13 +17,12 @@ from pydantic import ValidationError
 
 from agent.contract.arrays import Array
 from agent.contract.keys import COORDINATOR, MODE, PLANT, PLANT_STATE, estimate, measurement, node_who
-from agent.contract.messages import ZERO_STATE, Estimate, Measurement, Message, Mode, PlantState
+from agent.contract.messages import CEILING, ZERO_STATE, Estimate, Measurement, Message, Mode, PlantState
 from agent.contract.problem import Problem
 from agent.contract.recording import Logged
 
 Numbers = NDArray[np.int64]
 
-CEILING = 1e140  # squares of larger numbers overflow in the proofs
 GROWN = 1e130  # of a state that has grown so far, the next may be beyond it
 NAMED = 20  # so many faults of a kind are named, the others counted
 _ROWS = 1 << 20  # of the columns at first, where the run has so many steps

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import zenoh
 from runs import (
     MANY,
     PATIENCE,
@@ -220,31 +219,3 @@ def test_frozen_node_is_named_after_the_deadline(pair_path: Path, tmp_path: Path
             deadline=3.0,
         )
     assert roles_left() == {}
-
-
-def test_garbage_on_a_topic_ends_the_run_in_order(lone_path: Path, tmp_path: Path) -> None:
-    """A foreign message among the data: exit 3, one sentence that says where, and the recording is closed."""
-    recording = tmp_path / "run.mcap"
-    address = ""
-
-    def garbage() -> None:
-        config = zenoh.Config()
-        config.insert_json5("connect/endpoints", f'["{address}"]')
-        config.insert_json5("listen/endpoints", '["tcp/127.0.0.1:0"]')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        with zenoh.open(config) as session:
-            publisher = session.declare_publisher("peakmesh/test/event/somebody")
-            while not publisher.matching_status.matching:
-                time.sleep(0.01)
-            for _ in range(3):
-                publisher.put(b"hello")
-
-    def listen(word: dict[str, Any]) -> None:
-        nonlocal address
-        address = word["listening"][0] if "listening" in word else address
-
-    with pytest.raises(RunBroken, match="a message on event is not a Event: "):
-        run_here(lone_path, recording, at=20, do=garbage, heed=listen)
-    end = end_of(recording)
-    assert end is not None
-    assert end["status"] == "broken"

@@ -15,11 +15,13 @@ from runs import PATIENCE
 
 from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
-from agent.contract.messages import Acknowledged, Control, Mode
+from agent.contract.messages import Acknowledged, Control, Mode, Word
+from agent.guard import FORGED, OVERSIZED, REPEATED, UNREADABLE
 from agent.network import barrier, bus
 from agent.network.addresses import NONE
-from agent.network.bus import REPLAY_SECONDS, Bus
+from agent.network.bus import LONGEST_WORD, REPLAY_SECONDS, Bus
 from agent.network.configuration import Network
+from agent.network.gate import Admitted
 from agent.network.words import ChannelClosed, Incoming, Peer, Refused, Replayed, RunClosed, Sample
 
 
@@ -74,6 +76,10 @@ def steps_of(samples: list[Sample]) -> list[int]:
     return [Mode.decode(sample.payload).step for sample in samples]
 
 
+def steps_admitted(admitted: list[Admitted]) -> list[int]:
+    return [each.message.step for each in admitted]
+
+
 def test_what_was_published_before_anybody_listened_is_replayed(coordinator: Bus, recorder: Bus) -> None:
     """A publisher keeps what nobody has acknowledged: bytes, number, sender and topic."""
     publish(coordinator, range(5))
@@ -107,13 +113,13 @@ def test_a_channel_holds_messages_in_order(coordinator: Bus) -> None:
         plant.enter()
         list(coordinator.meet([PLANT]))
         publish(coordinator, range(500))
-        assert steps_of([channel.next() for _ in range(500)]) == list(range(500))
+        assert steps_admitted([channel.next() for _ in range(500)]) == list(range(500))
         assert list(channel.waiting()) == []
 
 
 def test_order_ends_the_run(coordinator: Bus, recorder: Bus) -> None:
     """An order of the coordinator to stop raises RunClosed with its reason."""
-    coordinator.order(Control(order="stop", steps=1, seed=0, window=1, external=[], reason="enough"))
+    coordinator.order(STOP)
     with pytest.raises(RunClosed) as caught:
         drain(recorder)
     assert caught.value.control.reason == "enough"
@@ -232,12 +238,33 @@ def test_a_question_that_is_not_the_recorders_is_ignored(coordinator: Bus, recor
     assert list(asked) == []
 
 
-@pytest.mark.parametrize("payload", [b"hello", b"{}", b'{"order": "dance"}'])
-def test_a_foreign_word_of_control_is_one_sentence(coordinator: Bus, recorder: Bus, payload: bytes) -> None:
-    """What peakmesh did not send on a key of control breaks the run with a sentence, not with a traceback."""
-    coordinator._session.say(CONTROL, payload)
-    with pytest.raises(RunBroken, match="what came on control is not from peakmesh: "):
+STOP = Control(order="stop", steps=1, seed=0, window=1, external=[], reason="enough")
+
+
+def test_a_foreign_word_is_counted_and_changes_nothing(coordinator: Bus, recorder: Bus) -> None:
+    """Not what is none, not what is too long, not what is signed by nobody who is known, not what was said before."""
+    forged = STOP.model_copy(update={"reason": "forged"})
+    signed = forged.model_copy(update={"session": "somebody"})
+    again = forged.model_copy(update={"session": coordinator._session.identity})  # and its number was used
+    coordinator.order(STOP.model_copy(update={"order": "start"}))
+    for word in (
+        b"hello",
+        b"{}",
+        b'{"order": "dance"}',
+        b" " * (LONGEST_WORD + 1),
+        b"",
+        *map(encoded, (signed, again)),
+    ):
+        coordinator._session.say(CONTROL, word)
+    coordinator.order(STOP)
+    with pytest.raises(RunClosed) as caught:
         drain(recorder)
+    assert caught.value.control.reason == "enough"
+    assert recorder.guard.refused() == {CONTROL: {UNREADABLE: 4, OVERSIZED: 1, FORGED: 1, REPEATED: 1}}
+
+
+def encoded(word: Word) -> bytes:
+    return word.model_dump_json().encode()
 
 
 def test_a_name_that_is_there_twice_is_refused(coordinator: Bus) -> None:

@@ -10,6 +10,7 @@ from made_recordings import random_gains, random_problem
 
 from agent.contract.errors import RecordingFailed, RunBroken
 from agent.contract.messages import Acknowledged, BrokenOff, Event
+from agent.guard import Guard
 from agent.network.words import Incoming
 from agent.plan import Plan
 from agent.roles import coordinator
@@ -27,6 +28,7 @@ class Scripted:
         self.now = 1000.0
         self._words = list(words)
         self.published: list[tuple[str, object]] = []
+        self.guard = Guard()
 
     def receive(self, *, timeout: float) -> Incoming | None:
         if self._words and self._words[0][0] <= timeout:

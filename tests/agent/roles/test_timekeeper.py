@@ -10,7 +10,7 @@ import pytest
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import Account, Mode
-from agent.network.words import Sample
+from agent.network.gate import Admitted
 from agent.plan import Pace, Plan
 from agent.roles.timekeeper import Timekeeper
 
@@ -31,9 +31,10 @@ class Wire:
         assert topic == "account"
         return self
 
-    def waiting(self) -> Iterator[Sample]:
+    def waiting(self) -> Iterator[Admitted]:
         while self._accounts:
-            yield Sample("account", self._accounts.pop().encode(), None)
+            account = self._accounts.pop()
+            yield Admitted("account", account.encode(), None, account)
 
     def publish(self, topic: str, message: Mode) -> None:
         assert topic == "mode"

@@ -18,7 +18,6 @@ from agent.contract.messages import Stamp, digest_of
 from agent.contract.recording import writer
 from agent.contract.recording.parts import files_of
 from agent.contract.recording.writer import Split
-from agent.network.words import Sample
 from agent.roles.record import Record
 from designer.replay import replay
 from designer.replay.part import Part
@@ -111,7 +110,7 @@ def test_parts_are_one_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         for sent in simulate(GAINS, steps=STEPS):
             payload = canonical(sent.document)
             stamp = Stamp(sent.number, 0, sent.who, digest_of(sent.topic, payload))
-            kept.take(Sample(sent.topic, payload, stamp), sent.document["step"])
+            kept.take(sent.topic, payload, stamp, sent.document["step"])
             kept.keep_up()
         kept.finish(status="finished", reason="")
     files = files_of(tmp_path / "run.mcap")

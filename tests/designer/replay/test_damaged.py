@@ -16,7 +16,6 @@ from agent.contract.messages import Stamp, digest_of
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
 from agent.contract.recording.writer import Split
-from agent.network.words import Sample
 from agent.roles.record import Record
 from designer.replay import replay
 
@@ -34,7 +33,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for number, sent in enumerate(simulate(GAINS, steps=STEPS)):
             payload = canonical(sent.document)
             stamp = Stamp(sent.number, number, sent.who, digest_of(sent.topic, payload))
-            record.take(Sample(sent.topic, payload, stamp), sent.document["step"])
+            record.take(sent.topic, payload, stamp, sent.document["step"])
             if number % 50 == 49:
                 record._writer._part._flush()  # type: ignore[union-attr]
         record.finish(status="finished", reason="")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import count
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from agent.contract.keys import MODE, RECORDER, alive, replay, session
 from agent.network.outbox import Sent
 from agent.network.session import CAPACITY
-from agent.network.words import ChannelClosed, Duty, Incoming, Namesake, Peer, Replayed, Sample
+from agent.network.words import ChannelClosed, Duty, Incoming, Replayed, Sample
 from simulated.machine import Machine, Process, Queue
 from simulated.network import Network, Pipe
 
@@ -33,8 +33,8 @@ class Published(NamedTuple):
 class Channel:
     """A topic's messages, in order."""
 
-    def __init__(self, machine: Machine) -> None:
-        self._queue = Queue(machine)
+    def __init__(self, machine: Machine, topic: str) -> None:
+        self.topic, self._queue = topic, Queue(machine)
 
     def put(self, sample: Sample | None) -> None:
         assert self._queue.qsize() < CAPACITY, "a channel that is full holds up its link"
@@ -47,13 +47,13 @@ class Channel:
             raise ChannelClosed
         return sample  # type: ignore[no-any-return]
 
-    def waiting(self) -> Iterator[Sample]:
-        while not self._queue.empty():
-            sample = self._queue.get_nowait()
-            if sample is None:
-                self._queue.put(None)
-                return
-            yield sample
+    def take(self) -> Sample | None:
+        if self._queue.empty():
+            return None
+        sample = self._queue.get_nowait()
+        if sample is None:  # the end, which `next` is to find
+            self._queue.put(None)
+        return sample  # type: ignore[no-any-return]
 
 
 class Door:
@@ -81,6 +81,7 @@ class Door:
         self._subscribers: list[tuple[str, Callable[[str, Sent | bytes], None]]] = []
         self._channels: list[Channel] = []
         self._watches: list[tuple[str, Callable[[str, bool], None]]] = []
+        self._is_for: Callable[[str], bool] = lambda by: True
         self._answer: Callable[[int, Callable[[Sent], None]], None] | None = None
         self._asked: dict[int, tuple[str, set[Door]]] = {}  # questions: about whom, and who has still to answer
         self._numbers = count()
@@ -90,7 +91,7 @@ class Door:
 
     # data
     def channel(self, topic: str) -> Channel:
-        channel = Channel(self._net.machine)
+        channel = Channel(self._net.machine, topic)
         self._channels.append(channel)
         self._subscribe(topic, lambda at, sent: channel.put(Sample(at, sent.payload, sent.stamp)))  # type: ignore[union-attr]
         return channel
@@ -103,13 +104,13 @@ class Door:
         self._log.append(Published(self.process.name, sent, self._net.machine.now))
         self._to_subscribers(sent.topic, sent, is_data=True)
 
-    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]]) -> None:
+    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str], bool]) -> None:
         def answer(first: int, reply: Callable[[Sent], None]) -> None:
             for sent in since(first):
                 self._net.machine.pause()
                 reply(sent)
 
-        self._answer = answer
+        self._answer, self._is_for = answer, is_for
         self._declare("queryable", replay(who))
 
     def request_replay(self, who: str, *, first: int, seconds: float) -> None:
@@ -127,7 +128,8 @@ class Door:
 
         def duty() -> Incoming | None:
             assert self._answer is not None
-            self._answer(first, reply)
+            if self._is_for(asker.identity):
+                self._answer(first, reply)
             self._send(asker, partial(asker._end_question, number, self))
             return None
 
@@ -149,7 +151,7 @@ class Door:
         """No viewer is there to ask."""
 
     # words
-    def listen(self, topic: str, decode: Callable[[bytes], Incoming]) -> None:
+    def listen(self, topic: str, decode: Callable[[bytes], Incoming | None], *, overflow: Callable[[], None]) -> None:
         self._subscribe(topic, lambda at, payload: self._hand_over_open(lambda: decode(payload)))  # type: ignore[arg-type]
 
     def say(self, topic: str, payload: bytes) -> None:
@@ -157,18 +159,14 @@ class Door:
         self._net.machine.note(self.process.name, f"says {topic} {payload.decode()[:200]}")
         self._to_subscribers(topic, payload, is_data=False)
 
-    def watch(self) -> None:
-        def see(topic: str, present: bool) -> None:
-            self._hand_over_open(lambda: Peer(topic.removeprefix(alive("")), present))
+    def watch(self, see: Callable[[str, str, bool], None]) -> None:
+        def hear(topic: str, present: bool) -> None:
+            _, who, *identity = topic.split("/")
+            if self.is_open:
+                see(who, "".join(identity), present)
 
-        self._watch(alive("*"), see)
-
-    def watch_namesakes(self, who: str) -> None:
-        def see(topic: str, present: bool) -> None:
-            if present:
-                self._hand_over_open(lambda: Namesake(topic.rpartition("/")[2]))
-
-        self._watch(session(who, "*"), see)
+        self._watch("session/*", hear)
+        self._watch(alive("sensor-*"), hear)
 
     def appear(self, who: str) -> None:
         for topic in (session(who, self.identity), alive(who)):

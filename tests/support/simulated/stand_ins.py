@@ -59,7 +59,7 @@ def _stand_ins(machine: Machine, seed: int) -> dict[int, Any]:
     chance = random.Random(f"{seed} identities")
     real: dict[Any, Any] = {
         time: _Time(machine),
-        threading: SimpleNamespace(Thread=lambda **about: _Thread(machine, **about)),
+        threading: SimpleNamespace(Thread=lambda **about: _Thread(machine, **about), Lock=threading.Lock),
         threading.Thread: lambda **about: _Thread(machine, **about),
         queue.SimpleQueue: lambda: Queue(machine),
         os: _Os(chance),
