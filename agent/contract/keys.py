@@ -16,8 +16,8 @@ Topics that run the run itself, not recorded; <who> is node-<n>, plant, sensor-<
 
 | topic                  | what        | from                       | to                                         |
 |------------------------|-------------|----------------------------|--------------------------------------------|
-| alive/<who>            | liveliness  | everyone                   | everyone: it is there, it is gone          |
-| session/<who>/<id>     | liveliness  | everyone but sensors       | <who>: is it there twice?                  |
+| alive/<who>            | liveliness  | everyone                   | sensor drivers; of sensors, everyone       |
+| session/<who>/<id>     | liveliness  | everyone but sensors       | everyone: it is there, it is gone          |
 | refused/<who>/<id>     | a sentence  | everyone but sensors       | session <id> of <who>: its place is taken  |
 | joining/<who>          | Joining     | everyone but sensors       | coordinator: where it is, whom it lacks    |
 | leaving/<who>          | Leaving     | everyone but sensors       | coordinator: why it goes                   |
