@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from agent.contract.keys import (
     ACCOUNT,
     ACKNOWLEDGED,
+    BESIDE,
     CONTROL,
     COORDINATOR,
     EVENT,
@@ -73,7 +74,7 @@ Counts = dict[str, dict[str, int]]  # by topic and kind
 class _Form(NamedTuple):
     """What the messages of a topic look like."""
 
-    senders: frozenset[str]
+    senders: frozenset[str]  # empty: anybody
     sizes: tuple[tuple[str, int], ...]  # of the vectors
     may_be_empty: bool
     longest: int  # bytes
@@ -191,9 +192,9 @@ class Guard:
         if form is None:
             if self._problem is not None or model_of(topic) is None:
                 raise Unfit(UNASKED)
-            form = self._forms[topic] = _Form(frozenset({sender_of(topic), ""}), (), True, 1 << 24)
+            form = self._forms[topic] = _any_form(topic)
         sender = stamp.sender if stamp is not None else ""
-        if sender not in form.senders:
+        if form.senders and sender not in form.senders:
             raise Unfit(FORGED)
         if stamp is not None:
             tags = self._tags.get(sender)
@@ -305,6 +306,12 @@ _ALL = (1 << WINDOW) - 1
 def in_words(counts: Mapping[str, int]) -> str:
     """3 forged, 1 unreadable."""
     return ", ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts.get(kind))
+
+
+def _any_form(topic: str) -> _Form:
+    """Of a problem that is not known."""
+    senders = frozenset[str]() if topic in BESIDE else frozenset({sender_of(topic), ""})
+    return _Form(senders, (), True, 1 << 24)
 
 
 def _topics(problem: Problem) -> Iterator[str]:

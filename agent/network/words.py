@@ -69,20 +69,8 @@ class Quota:
         self._out += 1
 
 
-Incoming = (
-    Sample
-    | Peer
-    | Namesake
-    | Control
-    | Acknowledged
-    | Joining
-    | Leaving
-    | Ready
-    | Refusals
-    | Replayed
-    | Facts
-    | Ignored
-)
+Said = Control | Acknowledged | Joining | Leaving | Ready | Refusals
+Incoming = Sample | Peer | Namesake | Said | Replayed | Facts | Ignored
 Duty = Callable[[], Incoming | None]  # decodes a word, or does what was asked for; called on the main thread
 T = TypeVar("T")
 
