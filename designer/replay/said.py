@@ -94,15 +94,19 @@ def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external:
 
 
 def _broken_off(has: Flags, said: Said) -> Flags:
-    """(steps,): at which the plant's state is not there, nor some measurements, and their nodes say they never came."""
+    """(steps,): at which the plant's state is not there, nor some measurements, and their nodes say they never came.
+
+    A node that is not there in such a step either says nothing.
+    """
     unheard = np.zeros((len(has), len(said._nodes)), dtype=bool)
     for step, i in said.unheard:
         if step < len(has):
             unheard[step, i] = True
     estimates = 2 + 2 * np.arange(len(said._nodes))
     unheard &= ~has[:, estimates + 1]
+    missed = ~has[:, estimates + 1] & ~has[:, estimates]
     explained = unheard | has[:, estimates + 1] | ~has[:, estimates]
-    return np.asarray(unheard.any(axis=1) & explained.all(axis=1) & ~has[:, 1])
+    return np.asarray((unheard | missed).any(axis=1) & explained.all(axis=1) & ~has[:, 1])
 
 
 def _went(steps: list[int], first: int, end: int) -> bool:
