@@ -101,13 +101,18 @@ def test_every_request_for_replay_is_answered_before_a_replay_is_over(recorder: 
 
 
 def test_who_began_with_the_run_is_not_sent_away_by_who_came_later(node: Bus) -> None:
-    node.has_begun = True
-    door(node).do(lambda: node._refuse(b"taken"))
+    """Nor is anybody, where nobody else of the name is to be seen."""
+    for is_there in (False, True):
+        if is_there:
+            for session in ("1", "2"):
+                node.guard.came("node-n0", session)
+            node.has_begun = True
+        door(node).do(lambda: node._refuse(b"taken"))
     door(node).hear(SAMPLE)
     assert node.receive() == SAMPLE
     node.is_late = True
     door(node).do(lambda: node._refuse(b"taken"))
-    with pytest.raises(Refused, match=r"^taken$"):
+    with pytest.raises(Refused, match=r'^node "n0" takes part in run "test" already; start it once$'):
         node.receive()
 
 
