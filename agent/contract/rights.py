@@ -28,6 +28,7 @@ from agent.contract.keys import (
     node_who,
     participants,
     ready,
+    refusals,
     refused,
     replay,
     sender_of,
@@ -65,17 +66,17 @@ def _rights(who: str, problem: Problem, run: str) -> Rights:
 
     if who == VIEWER:
         found = key("*", alive(COORDINATOR))  # whatever the run is called that it looks for
-        return Rights([], [key(run, watch("**"))], [], [*keys(alive("*")), found], [], keys(FACTS))
+        return Rights([], [key(run, watch("**"))], [], [*keys(alive("*"), session("*", "*")), found], [], keys(FACTS))
     data = _data(who, problem)
     if who.startswith(sensor_who("")):
         return Rights(keys(*data), keys(MODE), keys(alive(who)), keys(alive("*")), [], [])
     own = refused(who, "*"), session(who, "*")
     words = {COORDINATOR: [CONTROL], RECORDER: [ACKNOWLEDGED]}.get(who, [])
     return Rights(
-        says=keys(*data, *map(watch, data), *words, own[0], joining(who), leaving(who), ready(who)),
+        says=keys(*data, *map(watch, data), *words, own[0], joining(who), leaving(who), ready(who), refusals(who)),
         hears=[key(run, topic) for topic in (*_heard(who, problem), own[0])],
         shows=keys(alive(who), own[1]),
-        sees=keys(alive("*"), own[1]),
+        sees=keys(alive("*"), session("*", "*")),
         answers=keys(replay(who), *([FACTS] if who == RECORDER else [])),
         asks=keys(*map(replay, participants(problem))) if who == RECORDER else [],
     )
@@ -93,7 +94,7 @@ def _heard(who: str, problem: Problem) -> list[str]:
     if who == RECORDER:
         return [*data_topics(problem), EVENT, ACCOUNT, ready("*"), CONTROL]
     if who == COORDINATOR:
-        return [ACCOUNT, ACKNOWLEDGED, joining("*"), leaving("*"), ready("*")]
+        return [ACCOUNT, ACKNOWLEDGED, joining("*"), leaving("*"), ready("*"), refusals("*")]
     if who == PLANT:
         return [MODE, CONTROL, ACKNOWLEDGED]
     i = next(i for i, name in enumerate(problem.node_names) if node_who(name) == who)
