@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from agent.contract.errors import RunBroken
 from agent.contract.gains import NodeGains
-from agent.contract.messages import Estimate
+from agent.contract.messages import CEILING, Estimate, beyond_ceiling
 from agent.filter import Pair
 from agent.product import product
 
@@ -23,9 +23,9 @@ def told(
     measured: bool = True,
     origin: str = "",
 ) -> Estimate:
-    """The estimate of step k. Raises RunBroken where it is not finite: a message refuses NaN and infinity."""
+    """The estimate of step k. Raises RunBroken where it is not finite, or so large that nobody would take it."""
     try:
-        return Estimate(
+        estimate = Estimate(
             step=k,
             x_hat=pair.x_hat.tolist(),
             innovation=pair.innovation.tolist(),
@@ -35,5 +35,8 @@ def told(
             measured=measured,
             origin=origin,
         )
-    except ValidationError:
-        raise RunBroken(f'the estimate of node "{own.node}" is not finite at step {k}; its gains let it grow') from None
+    except ValidationError:  # a message refuses NaN and infinity
+        estimate = None
+    if estimate is None or beyond_ceiling(estimate.x_hat, estimate.innovation, estimate.z_hat):
+        raise RunBroken(f'the estimate of node "{own.node}" is beyond {CEILING:g} at step {k}; its gains let it grow')
+    return estimate

@@ -34,7 +34,6 @@ from agent.contract.keys import (
     sensor_who,
 )
 from agent.contract.messages import (
-    CEILING,
     ZERO_STATE,
     Account,
     Estimate,
@@ -44,6 +43,7 @@ from agent.contract.messages import (
     PlantState,
     Stamp,
     Word,
+    beyond_ceiling,
     tag_of,
 )
 from agent.contract.problem import Problem
@@ -221,7 +221,7 @@ class Guard:
             values: list[float] = getattr(message, name)
             if len(values) != size and (values or not form.may_be_empty):
                 raise Unfit(MISSHAPEN)
-            if values and not (min(values) >= -CEILING and max(values) <= CEILING):
+            if beyond_ceiling(values):
                 raise Unfit(INFINITE)
         if self._problem is not None:
             self._read(message, stamp.sender if stamp is not None else "")

@@ -17,6 +17,11 @@ _UNIT = "in the units of the problem"
 CEILING = 1e140  # of every number in a message: squares of larger ones overflow where messages are judged
 
 
+def beyond_ceiling(*vectors: list[float]) -> bool:
+    """Whether a number of a message is so large that nobody would take it."""
+    return any(not (min(values) >= -CEILING and max(values) <= CEILING) for values in vectors if values)
+
+
 class Message(Frozen):
     """Flat and finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
 

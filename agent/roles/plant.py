@@ -9,7 +9,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import MODE, PLANT, PLANT_STATE, measurement
-from agent.contract.messages import Control, Measurement, PlantState
+from agent.contract.messages import CEILING, Control, Measurement, PlantState, beyond_ceiling
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import Node
 from agent.contract.schedule import DisturbanceSource, Losses
@@ -78,9 +78,12 @@ class SimulatedPlant:
             raise RunBroken(f"the mode of step {step} came where that of step {self.step} was due")
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                return self._advance(step)
+                state, measurements = self._advance(step)
         except ValidationError:  # a message refuses NaN and infinity
-            raise RunBroken(f"the state of the plant is not finite at step {step}; its A lets it grow") from None
+            state = None
+        if state is None or beyond_ceiling(state.x, state.z, state.w, *(sent.y for sent in measurements.values())):
+            raise RunBroken(f"the state of the plant is beyond {CEILING:g} at step {step}; its A lets it grow")
+        return state, measurements
 
     def _advance(self, step: int) -> tuple[PlantState, dict[str, Measurement]]:
         plant, x = self._problem.plant, self._x
