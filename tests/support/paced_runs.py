@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from itertools import count
 
 import numpy as np
@@ -29,7 +29,7 @@ class PacedRun:
 
     `delay` is the network; `away` maps a node, "plant" to ranges of steps in which no process is there: a node begins
     anew afterwards, the plant goes on. `frozen` maps a node to ranges of steps in which nothing reaches it, until the
-    step after them, when all of it does.
+    step after them, when all of it does. What comes at (receiver, topic, step) of `unfit` is refused there.
     """
 
     def __init__(
@@ -41,10 +41,11 @@ class PacedRun:
         delay: Delay = lambda receiver, topic, step: SOON,
         away: dict[str, range] | None = None,
         frozen: dict[str, range] | None = None,
+        unfit: Container[tuple[str, str, int]] = (),
         pace: Pace = PACE,
     ) -> None:
         self._gains, self._steps, self._pace, self._delay = gains, steps, pace, delay
-        self._away, self._frozen = away or {}, frozen or {}
+        self._away, self._frozen, self._unfit = away or {}, frozen or {}, unfit
         self._deliveries = schedule.Deliveries(gains.problem, seed=seed)
         self._sent = _Numbered()
         self._events: list[tuple[float, int, Callable[[float], None]]] = []
@@ -113,7 +114,10 @@ class PacedRun:
 
         def arrive(now: float) -> None:
             if self.nodes[receiver] is node and not self._is_away(receiver):
-                node.take(sender, message, now)
+                if (receiver, topic, message.step) in self._unfit:
+                    node.refused(topic, now)
+                else:
+                    node.take(sender, message, now)
                 self._advance(receiver)
 
         if arrives < math.inf:

@@ -34,7 +34,9 @@ def told(run: PacedRun) -> Counter[tuple[str, str, int, str]]:
     return Counter(
         (sent.who.removeprefix("node-"), sent.document["about"], step, sent.document["kind"])
         for sent in run.messages
-        if sent.topic == "event" and sent.document["kind"] in ("late", "silent", "gone") and "steps" in sent.document
+        if sent.topic == "event"
+        and sent.document["kind"] in ("late", "silent", "gone", "refused")
+        and "steps" in sent.document
         for step in sent.document["steps"]
     )
 
@@ -127,6 +129,21 @@ def test_a_pair_counts_up_to_its_deadline(late: float, used: bool) -> None:
     for event in events:
         assert event["steps"] == [k]
         assert event["seconds"] == pytest.approx([late - PACE.hear_by * PACE.period], abs=1e-9)
+
+
+def test_what_is_refused_is_substituted_like_what_never_came_and_told_to_be_refused() -> None:
+    """Pairs and measurements: the numbers are those of a run that lost them, and each event has the reason."""
+    problem = GAINS.problem
+    node, other = (problem.node_names[i] for i in (next(j for j in problem.ever_heard(0) if j), 0))
+    unfit = {(node, f"node/{node}/measurement", 3), *((other, f"node/{node}/estimate", k) for k in range(2, STEPS - 1))}
+    run = PacedRun(GAINS, steps=STEPS, unfit=unfit)
+    lost = PacedRun(GAINS, steps=STEPS, delay=lambda *place: math.inf if place in unfit else SOON)
+    assert estimates(run.messages) == estimates(lost.messages)
+    said, silent = told(run), told(lost)
+    assert {kind for *_, kind in said} == {"refused"}
+    assert {kind for *_, kind in silent} == {"silent"}
+    assert {place[:3] for place in said} == {place[:3] for place in silent}
+    assert (node, f"node/{node}/measurement", 3, "refused") in said
 
 
 def test_a_measurement_that_comes_too_late_is_never_used() -> None:

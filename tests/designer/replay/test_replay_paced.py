@@ -119,6 +119,21 @@ def test_a_faulty_run_is_reproduced_exactly(tmp_path: Path, gains: Gains, fault:
     assert bool(pacing.pairs_lost) == bool(gains.problem.links)
 
 
+def test_what_nodes_refused_explains_what_they_did_without(tmp_path: Path) -> None:
+    problem = HIDDEN.problem
+    first, second = (problem.node_names[i] for i in (next(j for j in problem.ever_heard(0) if j), 0))
+    unfit = {(first, f"node/{first}/measurement", 5), *((second, f"node/{first}/estimate", k) for k in range(4, 40))}
+    sent = PacedRun(HIDDEN, steps=STEPS, unfit=unfit).messages
+    verdict = verdict_of(tmp_path, sent)
+    assert verdict.exit_code == 0, verdict.text()
+    assert verdict.pacing is not None
+    assert set(verdict.pacing.reasons) == {"refused"}
+    assert verdict.pacing.reasons["refused"] == verdict.pacing.pairs_substituted + 1 > 1
+    untold = [message for message in sent if message.document.get("kind") != "refused"]
+    (tmp_path / "untold").mkdir()
+    assert verdict_of(tmp_path / "untold", untold).exit_code != 0
+
+
 def test_a_run_without_faults_has_none(tmp_path: Path) -> None:
     verdict = verdict_of(tmp_path, PacedRun(HIDDEN, steps=STEPS).messages)
     assert verdict.exit_code == 0, verdict.text()
