@@ -41,8 +41,8 @@ def warnings(problem: Problem) -> list[str]:
 
 def notes(problem: Problem) -> list[str]:
     """What the problem assumes, and a user may not have meant: a column of w that is several things at once."""
-    moves = problem.plant.B.any(axis=0)
-    disturbs = np.array([node.D.any(axis=0) for node in problem.nodes])
+    moves = np.any(problem.plant.B != 0.0, axis=0)
+    disturbs = np.array([np.any(node.D != 0.0, axis=0) for node in problem.nodes])
     shared = [int(column) for column in np.flatnonzero(disturbs.sum(axis=0) + moves > 1) if disturbs[:, column].any()]
     if not shared:
         return []

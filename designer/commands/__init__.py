@@ -17,7 +17,7 @@ PROBLEM = "problem file, or the name of a built-in problem (peakmesh show lists 
 
 
 def tell_notes(problem: Problem) -> list[str]:
-    """What the problem assumes (designer/diagnosis.py), on stderr and returned; of a built-in one `show` alone tells."""
+    """What the problem assumes (designer/diagnosis.py), on stderr and returned; of built-in ones `show` alone tells."""
     from designer.diagnosis import notes
     from designer.problems import is_built_in
 
