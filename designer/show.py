@@ -14,6 +14,7 @@ from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
+from designer.diagnosis import notes
 from designer.problems import is_another
 
 MCAP_MAGIC = b"\x89MCAP"
@@ -122,6 +123,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "lossy_links": {f"{link.sender} to {link.receiver}": link.delivery_probability for link in problem.links or ()},
         "unbiased": bool(problem.unbiased),
         "disturbance": problem.disturbance.kind,
+        "notes": notes(problem),
         "digest": problem.digest(),
     }
 

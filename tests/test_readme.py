@@ -13,6 +13,7 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.analysis import analyse, load_given
 from designer.cli import main
+from designer.diagnosis import notes
 
 README = (ROOT / "README.md").read_text()
 
@@ -41,6 +42,11 @@ def test_its_example_of_a_real_network_is_one() -> None:
     assert (problem.carries_plant, problem.delivery.tolist()) == (False, [[1.0, 1.0], [0.95, 1.0]])
     document["plant"]["A"][0][0] = 1.02
     Problem.from_document(document)
+
+
+def test_its_problem_has_a_column_of_w_for_each_noise() -> None:
+    """Whoever copies it has independent noises."""
+    assert notes(Problem.from_document(tomllib.loads(blocks("toml")[0]))) == []
 
 
 def test_its_plain_gains_are_analysed_as_it_says(tmp_path: Path) -> None:

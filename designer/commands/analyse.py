@@ -9,7 +9,7 @@ from pathlib import Path
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM
+from designer.commands import PROBLEM, tell_notes
 
 
 def add_analyse(commands: Subcommands) -> None:
@@ -39,7 +39,7 @@ def analyse_command(options: argparse.Namespace) -> int:
         refuse_overwrite(options.output, force=options.force)
     given = load_given(options.gains, problem)
     analysis = analyse(problem, given)
-    facts, text = analysis.document() | {"output": None}, analysis.text()
+    facts, text = analysis.document() | {"notes": tell_notes(problem), "output": None}, analysis.text()
     if options.output is not None and analysis.stable:
         gains = certified(problem, given)
         gains.save(options.output, force=options.force)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM
+from designer.commands import PROBLEM, tell_notes
 from designer.commands.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -124,6 +124,7 @@ def design_and_save(
     warned = warnings(problem)
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
+    noted = tell_notes(problem)
     method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
@@ -148,6 +149,7 @@ def design_and_save(
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
         "warnings": warned,
+        "notes": noted,
         "output": str(path),
     }
 

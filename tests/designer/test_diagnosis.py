@@ -13,7 +13,7 @@ from networks import random_problem, real_network
 from agent.contract.errors import Unattainable
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.diagnosis import closed_classes, explained, obstacles, warnings
+from designer.diagnosis import closed_classes, explained, notes, obstacles, warnings
 from designer.problems import find
 from designer.proof.hidden import grows_unseen
 from designer.synthesis import design
@@ -304,6 +304,49 @@ def test_the_command_warns_on_stderr_and_in_json(tmp_path: Path, capsys: pytest.
     said = 'node "1": arrival_probability 0.01 is below 0.05; its measurements hardly count'
     assert f"warning: {said}" in printed.err
     assert json.loads(printed.out)["warnings"] == [said]
+
+
+# notes
+def test_a_column_of_w_that_is_several_things_is_noted() -> None:
+    """The plant's and a noise, or the noise of two nodes; the node's own measurements may share one."""
+    own = find("two-nodes").document()
+
+    def noted(left: list[float], right: list[float], B: list[float]) -> list[str]:
+        nodes = [node | {"D": [D]} for node, D in zip(own["node"], (left, right), strict=True)]
+        return notes(Problem.from_document(own | {"node": nodes, "plant": own["plant"] | {"B": [B]}}))
+
+    assert notes(find("two-nodes")) == notes(find("quadruple-tank")) == notes(find("inverted-pendulum")) == []
+    assert noted([0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]) == []
+    (said,) = noted([0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0])
+    assert said.startswith('column 2 of w is the noise of nodes "left" and "right": gamma is for disturbances that ')
+    (said,) = noted([0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0])
+    assert said.startswith('column 3 of w moves the plant and is the noise of node "left": ')
+    (said,) = noted([0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 1.0])
+    assert "(and 1 more column of the kind)" in said
+
+
+def test_the_command_notes_it_of_problems_that_are_the_users(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On stderr, and in --json; of the paper's own examples in --json and by show alone."""
+    path, output = tmp_path / "made.toml", str(tmp_path / "made.gains.json")
+    path.write_text(PROBLEM)
+    note = notes(Problem.load(path))[0]
+    assert main(["design", str(path), "-o", output, "--method", "decomposed", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert (printed.err.count(note), json.loads(printed.out)["notes"]) == (1, [note])
+    assert main(["analyse", str(path), "--gains", output, "--json"]) == 0
+    printed = capsys.readouterr()
+    assert (printed.err.count(note), json.loads(printed.out)["notes"]) == (1, [note])
+    assert main(["show", str(path)]) == 0
+    assert note in capsys.readouterr().out
+
+    built_in = notes(find("zhu2020-lossy"))
+    assert main(["design", "zhu2020-lossy", "-o", output, "--force", "--method", "decomposed", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert ("column 1 of w" in printed.err, json.loads(printed.out)["notes"]) == (False, built_in)
+    assert main(["show", "zhu2020-lossy", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == built_in
 
 
 def pendulum(rate: float, C: list[list[float]], **changes: object) -> Problem:
