@@ -20,6 +20,7 @@ from designer.commands import (
     export,
     identify,
     keys,
+    new,
     recordings,
     recover,
     report,
@@ -27,6 +28,7 @@ from designer.commands import (
     runs,
     show,
     simulate,
+    sweep,
     verify,
     watch,
 )
@@ -43,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"peakmesh {version('peakmesh')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     runs.add_demo(commands)
+    new.add_new(commands)
     design.add_design(commands)
+    sweep.add_sweep(commands)
     analyse.add_analyse(commands)
     verify.add_verify(commands)
     runs.add_run(commands)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError, Unattainable, counted, listed
+from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.problem import Problem
 from designer.model.units import natural_units
 from designer.proof.hidden import grows_unseen
@@ -37,24 +37,6 @@ _COMPUTED = "; this is computed, not proved"
 def warnings(problem: Problem) -> list[str]:
     """What makes the design hard, or the result odd, though the problem is legal; each a sentence with its number."""
     return [*_warned_plant(problem), *_warned_chances(problem), *_warned_modes(problem)]
-
-
-def notes(problem: Problem) -> list[str]:
-    """What the problem assumes, and a user may not have meant: a column of w that is several things at once."""
-    moves = np.any(problem.plant.B != 0.0, axis=0)
-    disturbs = np.array([np.any(node.D != 0.0, axis=0) for node in problem.nodes])
-    shared = [int(column) for column in np.flatnonzero(disturbs.sum(axis=0) + moves > 1) if disturbs[:, column].any()]
-    if not shared:
-        return []
-    column = shared[0]
-    of = [name for name, there in zip(problem.node_names, disturbs[:, column], strict=True) if there]
-    roles = ["moves the plant"] if moves[column] else []
-    roles.append(f"is the noise of {'node' if len(of) == 1 else 'nodes'} {listed(of)}")
-    more = f" (and {counted(len(shared) - 1, 'more column')} of the kind)" if len(shared) > 1 else ""
-    return [
-        f"column {column + 1} of w {' and '.join(roles)}{more}: gamma is for disturbances that are one and the same; "
-        "noises that are independent need a column of their own in B and every D"
-    ]
 
 
 def refuse_nothing_to_estimate(problem: Problem) -> None:

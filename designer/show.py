@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
-from designer.diagnosis import notes
-from designer.problems import is_another
+from designer.problems import find, is_another, text_of
+from designer.problems.notes import notes
+from designer.problems.written import to_toml
 
 MCAP_MAGIC = b"\x89MCAP"
 LARGEST = 1 << 28  # bytes of a problem or gains file
@@ -28,13 +30,18 @@ def describe(
     run: str | None = None,
     gains: Path | None = None,
     report: Progress | None = None,
+    settings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The facts of a file, or of a built-in problem given by its name; without one, the built-in problems.
 
     `kind` is "problem", "gains", "recording" or "built-in problems". Of a recording, `run` chooses among several runs,
     `gains` is the gains file where a tool left its own out, and `report` is told the bytes read, and of how many. The
-    file is read once, so it may be a pipe. Raises InputError for anything else.
+    file is read once, so it may be a pipe. `settings` are for a problem (designer/problems/settings.py). Raises
+    InputError for anything else.
     """
+    if settings:
+        _refuse_settings(file, settings)
+        return {"file": str(file)} | _problem(find(str(file), settings))
     if file is None:
         return {"kind": "built-in problems", "problems": {name: _size(_built_in(name)) for name in built_in_names()}}
     path = Path(file)
@@ -57,6 +64,29 @@ def describe(
     if path.suffix == ".toml":
         return {"file": str(path), **_problem(Problem.load(path))}
     raise InputError(f"{path} is neither a problem (.toml), nor a gains file (JSON), nor a recording (MCAP)")
+
+
+def _refuse_settings(file: str | Path | None, settings: Sequence[str]) -> None:
+    if file is None or (Path(file).suffix != ".toml" and str(file) not in built_in_names()):
+        raise InputError(f"--set {settings[0]} is for a problem, a .toml file or a built-in one")
+
+
+def as_toml(file: str | Path, *, settings: Sequence[str] = ()) -> str:
+    """A problem as the text of its file: a built-in one with its comments, that of gains, or one with `settings`.
+
+    Raises InputError where there is no problem, or its disturbance is a table that stands in another file.
+    """
+    path = Path(file)
+    if str(file) in built_in_names() and not settings:
+        return text_of(str(file))
+    if settings or path.suffix == ".toml":
+        _refuse_settings(file, settings or ["--toml"])
+        problem = find(str(file), settings)
+    else:
+        problem = Gains.load(path).problem
+    if problem.disturbance.kind == "csv":
+        raise InputError(f"{path}: its disturbance is the table of a CSV file, which --toml does not write")
+    return to_toml(problem)
 
 
 def attachment(path: Path, name: str, *, run: str | None = None, gains: Path | None = None) -> bytes:

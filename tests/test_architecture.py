@@ -59,6 +59,7 @@ ROOMS = {
     "designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
+    "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
     "designer.simulation": "designer.gain designer.model designer.workers",
@@ -69,11 +70,11 @@ ROOMS = {
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
-    "designer.show": "agent.contract.recording designer.diagnosis designer.problems",
+    "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis designer.compare "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
     "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
-    "designer.simulation designer.synthesis designer.watch designer.what_if",
+    "designer.simulation designer.sweep designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }

@@ -13,7 +13,7 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.analysis import analyse, load_given
 from designer.cli import main
-from designer.diagnosis import notes
+from designer.problems.notes import notes
 
 README = (ROOT / "README.md").read_text()
 

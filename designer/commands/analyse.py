@@ -9,7 +9,7 @@ from pathlib import Path
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, tell_notes
+from designer.commands import PROBLEM, add_set, tell_notes
 
 
 def add_analyse(commands: Subcommands) -> None:
@@ -18,6 +18,7 @@ def add_analyse(commands: Subcommands) -> None:
         commands, "analyse", analyse_command, "the exact gain of any gains on a problem, and the worst disturbances"
     )
     analyse.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
+    add_set(analyse)
     analyse.add_argument(
         "--gains", type=Path, required=True, metavar="FILE", help='gains file, or a plain JSON with "K" and "H" alone'
     )
@@ -34,7 +35,7 @@ def analyse_command(options: argparse.Namespace) -> int:
     from designer.ladder import rounded_up
     from designer.problems import find
 
-    problem = find(options.problem)
+    problem = find(options.problem, options.settings)
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
     given = load_given(options.gains, problem)

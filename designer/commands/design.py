@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, tell_notes
+from designer.commands import PROBLEM, add_set, tell_notes
 from designer.commands.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def add_design(commands: Subcommands) -> None:
     """Describe `design` to the parser."""
     design = add_command(commands, "design", design_command, "gains with a certificate, for a problem")
     design.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
+    add_set(design)
     design.add_argument("-o", "--output", type=Path, metavar="FILE", help="gains file (<problem>.gains.json)")
     add_method(design)
     design.add_argument(
@@ -81,7 +82,7 @@ def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
     from designer.problems import find
 
-    problem = _what_is_left(find(options.problem), options.without_node, options.without_link)
+    problem = _what_is_left(find(options.problem, options.settings), options.without_node, options.without_link)
     if options.price:
         return _price_command(problem, options)
     _, result = design_and_save(

@@ -62,7 +62,7 @@ def identify_command(options: argparse.Namespace) -> int:
 
 def _write(problem: Problem, path: Path, *, force: bool) -> None:
     """problem.toml, and the CSV file of its disturbance beside it, first."""
-    from designer.identify.estimate import to_toml
+    from designer.problems.written import to_toml
 
     table = path.with_suffix(".csv")
     if problem.disturbance.kind == "csv":

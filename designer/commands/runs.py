@@ -21,7 +21,7 @@ from agent.commands.options import (
 from agent.commands.words import run_text
 from agent.contract.errors import InputError, RecordingFailed
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM
+from designer.commands import PROBLEM, add_set
 from designer.commands.design import add_method, design_and_save, design_text
 from designer.commands.report import write_page
 
@@ -30,6 +30,7 @@ def add_demo(commands: Subcommands) -> None:
     """Describe `demo` to the parser."""
     demo = add_command(commands, "demo", demo_command, "design, run, replay and report an example (zhu2020-lossy)")
     demo.add_argument("problem", nargs="?", default="zhu2020-lossy", metavar="PROBLEM", help=PROBLEM)
+    add_set(demo)
     add_method(demo)
     agent.commands.run.add_run_options(demo, output=("FOLDER", "for the files (recordings/demo-<time>)"))
 
@@ -39,7 +40,7 @@ def demo_command(options: argparse.Namespace) -> int:
     from designer.problems import find
     from designer.report.account import Account
 
-    problem = find(options.problem)
+    problem = find(options.problem, options.settings)
     folder = options.output or Path("recordings") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --output takes the folder for the demo's files")
@@ -75,6 +76,7 @@ def add_run(commands: Subcommands) -> None:
     """Describe `run` to the parser."""
     run = add_command(commands, "run", run_command, "run every role as a process on this machine")
     run.add_argument("gains", metavar="PROBLEM_OR_GAINS", help=f"gains file, {PROBLEM}")
+    add_set(run)
     add_method(run)
     agent.commands.run.add_run_options(run)
     add_recording_options(run)
@@ -84,6 +86,8 @@ def run_command(options: argparse.Namespace) -> int:
     """`peakmesh run PROBLEM_OR_GAINS`: a problem is designed first, its gains stand beside the recording."""
     path = Path(options.gains)
     if path.suffix == ".json" or (path.is_file() and path.suffix != ".toml"):
+        if options.settings:
+            raise InputError(f"--set {options.settings[0]} changes a problem; {path} has its gains already")
         for option in ("method", "budget"):
             if getattr(options, option) is not None:
                 raise InputError(f"--{option} says how to design a problem; {path} has its gains already")
@@ -93,7 +97,7 @@ def run_command(options: argparse.Namespace) -> int:
     from designer.ladder import rounded_up
     from designer.problems import find
 
-    problem = find(options.gains)
+    problem = find(options.gains, options.settings)
     if options.output is None:
         options.output = default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_recording(options.output, force=options.force)

@@ -10,6 +10,7 @@ from pathlib import Path
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite, write_whole
+from designer.commands import add_set
 from designer.commands.recordings import Progress, add_choice
 
 
@@ -17,11 +18,15 @@ def add_show(commands: Subcommands) -> None:
     """Describe `show` to the parser."""
     show = add_command(commands, "show", show_command, "what a file is; without one, the built-in problems")
     show.add_argument("file", nargs="?", metavar="FILE", help="problem, gains file or recording")
+    add_set(show)
+    show.add_argument(
+        "--toml", action="store_true", help="a problem as its file, also a built-in one, or that of a gains file"
+    )
     add_choice(show)
     show.add_argument(
         "--get", metavar="NAME", help="take an attachment out of a recording: layout.json, gains.json or problem.json"
     )
-    show.add_argument("-o", "--output", type=Path, metavar="FILE", help="where --get writes it to (to stdout)")
+    show.add_argument("-o", "--output", type=Path, metavar="FILE", help="where --get and --toml write to (to stdout)")
     show.add_argument("--force", action="store_true", help="replace that file if it exists")
     show.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -30,15 +35,35 @@ def show_command(options: argparse.Namespace) -> int:
     """`peakmesh show [FILE]`."""
     from designer import show
 
+    if options.toml:
+        return _toml(options)
     if options.get is not None:
         return _get(options)
     if options.output is not None:
-        raise InputError("--output is for --get, which takes an attachment out of a recording")
+        raise InputError("--output is for --get, which takes an attachment out of a recording, and for --toml")
     tell = Progress()
     facts = show.describe(
-        options.file, run=options.run, gains=options.gains, report=lambda done, of: tell("reading", done, of)
+        options.file,
+        run=options.run,
+        gains=options.gains,
+        report=lambda done, of: tell("reading", done, of),
+        settings=options.settings,
     )
     print(json.dumps(facts) if options.json else show.text(facts))
+    return EXIT_GOOD
+
+
+def _toml(options: argparse.Namespace) -> int:
+    """`peakmesh show PROBLEM --toml`."""
+    from designer import show
+
+    if options.file is None or options.get is not None or options.json:
+        raise InputError("--toml prints one problem as its file; name the problem, and leave --get and --json out")
+    text = show.as_toml(options.file, settings=options.settings)
+    if options.output is None:
+        print(text, end="")
+    else:
+        write_whole(options.output, text.encode(), force=options.force)
     return EXIT_GOOD
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from agent.commands.options import Subcommands, add_command, load_gains
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted, listed
+from designer.commands import add_set
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -29,6 +30,7 @@ def add_verify(commands: Subcommands) -> None:
     verify.add_argument(
         "problem", nargs="?", metavar="PROBLEM", help="problem.toml, or a built-in problem, that they have to be for"
     )
+    add_set(verify)
     verify.add_argument(
         "--balls", action="store_true", help="in ball arithmetic alone: slower, and nothing is assumed of numpy"
     )
@@ -41,8 +43,10 @@ def verify_command(options: argparse.Namespace) -> int:
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
 
+    if options.settings and options.problem is None:
+        raise InputError(f"--set {options.settings[0]} is for PROBLEM; name the problem that the gains have to be for")
     gains = load_gains(options.gains)
-    differs = [] if options.problem is None else _differences(gains.problem, find(options.problem))
+    differs = [] if options.problem is None else _differences(gains.problem, find(options.problem, options.settings))
     if set(differs) - _BESIDE:
         return _for_another(gains, options, differs)
     started = time.perf_counter()

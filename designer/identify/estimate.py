@@ -1,9 +1,6 @@
-"""The problem with what was observed in place of what was assumed, and how it is written down."""
+"""The problem with what was observed in place of what was assumed."""
 
 from __future__ import annotations
-
-import json
-from typing import Any
 
 from agent.contract.errors import InputError, counted
 from agent.contract.problem import Problem
@@ -36,29 +33,3 @@ def observed(problem: Problem, counts: Counts) -> Problem:
     if rho:
         changed["link"] = [{"receiver": i, "sender": j, "delivery_probability": share} for (i, j), share in rho.items()]
     return Problem.from_document(changed)
-
-
-def to_toml(problem: Problem, *, csv: str = "") -> str:
-    """The text of a problem.toml; `csv` is the name of the file that has its disturbance, where that is a table."""
-    document = problem.document()
-    disturbance = document.get("disturbance")
-    if disturbance is not None and disturbance["kind"] == "csv":
-        document["disturbance"] = {"kind": "csv", "file": csv}
-    plain = {key: value for key, value in document.items() if not _is_table(value)}
-    lines = _entries(plain)
-    for key, value in document.items():
-        if isinstance(value, dict):
-            lines += ["", f"[{key}]", *_entries(value)]
-        elif _is_table(value):
-            for entry in value:
-                lines += ["", f"[[{key}]]", *_entries(entry)]
-    return "\n".join(lines) + "\n"
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict) or (isinstance(value, list | tuple) and isinstance(value[0], dict))
-
-
-def _entries(table: dict[str, Any]) -> list[str]:
-    """Text, numbers, true and false, and lists of them are written in TOML as in JSON."""
-    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items() if value is not None]

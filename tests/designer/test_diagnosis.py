@@ -13,8 +13,9 @@ from networks import random_problem, real_network
 from agent.contract.errors import Unattainable
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.diagnosis import closed_classes, explained, notes, obstacles, warnings
+from designer.diagnosis import closed_classes, explained, obstacles, warnings
 from designer.problems import find
+from designer.problems.notes import notes
 from designer.proof.hidden import grows_unseen
 from designer.synthesis import design
 

@@ -8,6 +8,7 @@ between them; `file` is how it is written down.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -35,9 +36,14 @@ class Problem(Model):
     unbiased: bool | None = Field(default=None, strict=True)  # sum over j of a_ij K_ij = A, imposed; None: it is not
 
     @classmethod
-    def load(cls, path: Path) -> Self:
-        """Read a problem.toml. Raises InputError: one sentence naming the place, the value, what is right."""
+    def load(cls, path: Path, revise: Callable[[dict[str, Any]], None] | None = None) -> Self:
+        """Read a problem.toml; `revise` may change what it says before it is checked.
+
+        Raises InputError: one sentence naming the place, the value, what is right.
+        """
         document = file.read_toml(path)
+        if revise is not None:
+            revise(document)
         try:
             file.read_csv(document, folder=path.parent)
             return cls.from_document(document)

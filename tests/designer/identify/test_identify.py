@@ -16,9 +16,10 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.cli import main
 from designer.identify.counts import Count, Counts, counts_of, total
-from designer.identify.estimate import observed, to_toml
+from designer.identify.estimate import observed
 from designer.identify.fit import Finding, findings, interval, likelihood_ratio
 from designer.problems import find, names
+from designer.problems.written import to_toml
 from designer.replay.log import load
 
 PROBLEM = real_problem(6, seen=True, links=True, unbiased=False, ny=(1, 1, 1), modes=3)

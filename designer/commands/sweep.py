@@ -1,0 +1,54 @@
+"""`peakmesh sweep`: gamma over the values of one key of a problem."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from agent.commands.options import Subcommands, add_command, add_output_options
+from agent.contract.errors import EXIT_GOOD, EXIT_NO
+from agent.contract.files import refuse_overwrite, write_whole
+from designer.commands import PROBLEM, add_set, tell_notes
+from designer.commands.design import add_method
+
+
+def add_sweep(commands: Subcommands) -> None:
+    """Describe `sweep` to the parser."""
+    sweep = add_command(commands, "sweep", sweep_command, "a design for each of several values in a problem, as CSV")
+    sweep.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
+    add_set(sweep, also="; one is KEY=a:b:n, n values from a to b")
+    add_method(sweep)
+    sweep.add_argument("--dask", metavar="ADDRESS", help="the designs run on this Dask cluster")
+    add_output_options(sweep, "FILE", "CSV file (to stdout)")
+    sweep.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def sweep_command(options: argparse.Namespace) -> int:
+    """`peakmesh sweep PROBLEM --set KEY=a:b:n`: exit code 1 where no value has gains."""
+    if options.output is not None:
+        refuse_overwrite(options.output, force=options.force)
+    from designer.search.effort import BUDGET
+    from designer.sweep import as_csv, document, problems, sweep
+
+    over, revised = problems(options.problem, options.settings)
+    noted = tell_notes(revised[0])
+    points = sweep(
+        over,
+        revised,
+        method=options.method,
+        budget=BUDGET if options.budget is None else options.budget,
+        dask=options.dask,
+        report=_show,
+    )
+    if options.output is not None:
+        write_whole(options.output, as_csv(over, points).encode(), force=options.force)
+    if options.json:
+        print(json.dumps(document(over, points) | {"notes": noted, "output": options.output and str(options.output)}))
+    else:
+        print(as_csv(over, points) if options.output is None else f"table      {options.output}\n", end="")
+    return EXIT_NO if all(point.gamma is None for point in points) else EXIT_GOOD
+
+
+def _show(done: int, of: int, what: str) -> None:
+    print(f"{done:4d} of {of} designs, {what}", file=sys.stderr)

@@ -1,0 +1,26 @@
+"""What is legal in a problem, and a user may not have meant."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.contract.errors import counted, listed
+from agent.contract.problem import Problem
+
+
+def notes(problem: Problem) -> list[str]:
+    """A column of w that is several things at once, in a sentence that says what gamma then is."""
+    moves = np.any(problem.plant.B != 0.0, axis=0)
+    disturbs = np.array([np.any(node.D != 0.0, axis=0) for node in problem.nodes])
+    shared = [int(column) for column in np.flatnonzero(disturbs.sum(axis=0) + moves > 1) if disturbs[:, column].any()]
+    if not shared:
+        return []
+    column = shared[0]
+    of = [name for name, there in zip(problem.node_names, disturbs[:, column], strict=True) if there]
+    roles = ["moves the plant"] if moves[column] else []
+    roles.append(f"is the noise of {'node' if len(of) == 1 else 'nodes'} {listed(of)}")
+    more = f" (and {counted(len(shared) - 1, 'more column')} of the kind)" if len(shared) > 1 else ""
+    return [
+        f"column {column + 1} of w {' and '.join(roles)}{more}: gamma is for disturbances that are one and the same; "
+        "noises that are independent need a column of their own in B and every D"
+    ]
