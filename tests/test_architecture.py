@@ -25,17 +25,20 @@ ROOMS = {
     "agent.product": "",
     "agent.filter": "agent.product",
     "agent.inbox": "agent.filter",
+    "agent.guard": "agent.plan",
+    "agent.refusals": "agent.guard",
     "agent.estimates": "agent.filter agent.product",
     "agent.pacing": "agent.estimates agent.filter agent.inbox agent.plan",
     "agent.receipts": "",
     "agent.signals": "",
-    "agent.network": "agent.plan agent.signals",
+    "agent.network": "agent.guard agent.plan agent.signals",
     "agent.authority": "agent.network",
-    "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.inbox agent.network "
-    "agent.pacing agent.plan agent.product agent.receipts agent.signals",
+    "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.guard agent.inbox "
+    "agent.network agent.pacing agent.plan agent.product agent.receipts agent.refusals agent.signals",
     "agent.children": "",
     "agent.launch": "agent.children agent.contract.recording agent.plan agent.signals",
-    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.launch agent.network agent.plan "
+    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.guard agent.launch agent.network "
+    "agent.plan "
     "agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",

@@ -20,9 +20,9 @@ from rewriting import read, write
 
 from designer.ladder import rounded_up
 from designer.report.account import Account
-from designer.report.scales import brief
 from designer.report.page import CLOSE_UP, MOST_COLUMNS, page
 from designer.report.page.words import divergence_sentence, error_sentence, verdict_sentence
+from designer.report.scales import brief
 
 VOID = {"meta", "img", "input", "br", "path", "circle"}
 
