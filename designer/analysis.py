@@ -19,6 +19,7 @@ from agent.contract.errors import InputError, first_fault
 from agent.contract.files import read_bytes, read_json
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
+from designer.beyond_gamma import BeyondGamma, beyond_gamma, told
 from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
@@ -61,6 +62,7 @@ class Analysis(NamedTuple):
     fixed_within: int  # the steps that it was sought over
     w: Array | None  # (at most fixed_within, nw), of energy 1
     unproved: str | None = None  # why no gamma is certified, where the gain is finite
+    beyond: BeyondGamma | None = None  # noise, and each node by itself
 
     @property
     def foreign(self) -> bool:
@@ -92,6 +94,7 @@ class Analysis(NamedTuple):
                 "searched_steps": self.fixed_within,
                 "w": self.w.tolist(),
             },
+            **({"white_noise": None, "node_gains": None} if self.beyond is None else self.beyond.document()),
         }
 
     def text(self) -> str:
@@ -134,6 +137,7 @@ class Analysis(NamedTuple):
             f"           that is fixed beforehand: gain {self.fixed:.6g} "
             f'from mode "{problem.markov.initial}" '
             f"over {_steps(self.fixed_within)}",
+            *([] if self.beyond is None else told(self.beyond.document())),
         ]
         return "\n".join(lines)
 
@@ -197,6 +201,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
         fixed_within=fixed.within,
         w=fixed.w,
         unproved=verdict.failure,
+        beyond=beyond_gamma(problem, given.K, given.H),
     )
 
 

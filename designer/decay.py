@@ -33,6 +33,7 @@ _STRICT_WHERE_SLOW = 1e-6
 _SLOW = 0.98  # radius from which on one P would end the recursion late
 _ROUNDS = 8
 _FLOOR = 1e-6  # of I that is in every U, so that P > 0
+_EXACT = 1e-12
 _REST = 0.25  # what is left of U may be off by, measured by U
 
 
@@ -139,31 +140,35 @@ def _total(L: Map, modes: int, n: int) -> tuple[Array | None, Array | None]:
         if not largest < _HUGE:
             break
         total = total + term
-    Z = _solved(L, modes, n)
+    Z = solution(L, eye, enough=_REST / np.sqrt(modes * n))
     if Z is None or not np.isfinite(Z).all() or np.abs(Z).max() > _HUGE:
         return None, None
     rest = Z - L(Z)
     return (Z, rest) if np.abs(rest - eye).sum(axis=2).max() < 2.0 * _REST else (None, None)
 
 
-def _solved(L: Map, modes: int, n: int) -> Array | None:
-    """Z of Z - L(Z) = I, as exactly as is enough."""
+def solution(L: Map, right: Array, *, enough: float = _EXACT) -> Array | None:
+    """X of X - L(X) = right, (modes, n, n), symmetric; of what is too large to be solved at once to `enough` of it.
+
+    None where there is none, or it is not found.
+    """
+    modes, n = right.shape[:2]
     pack, unpack = _packing(modes, n)
-    right, order = pack(np.broadcast_to(np.eye(n), (modes, n, n))), modes * n * (n + 1) // 2
+    b, order = pack(right), modes * n * (n + 1) // 2
     if order <= _DENSE:
         I_L = np.eye(order) - _matrix(L, modes, n)
         if not np.isfinite(I_L).all():
             return None
         try:
-            z = np.linalg.solve(I_L, right)
-            return unpack(z + np.linalg.solve(I_L, right - I_L @ z))
+            x = np.linalg.solve(I_L, b)
+            return unpack(x + np.linalg.solve(I_L, b - I_L @ x))
         except np.linalg.LinAlgError:
             return None
     from scipy.sparse.linalg import LinearOperator, gmres
 
-    I_L = LinearOperator((order, order), matvec=lambda z: z - pack(L(unpack(z))), dtype=np.float64)
-    z, _ = gmres(I_L, right, rtol=_REST / np.sqrt(modes * n), restart=60, maxiter=5)
-    return unpack(z)
+    I_L = LinearOperator((order, order), matvec=lambda x: x - pack(L(unpack(x))), dtype=np.float64)
+    x, _ = gmres(I_L, b, rtol=enough, restart=60, maxiter=5)
+    return unpack(x)
 
 
 def lasting(L: Map, first: Array) -> tuple[Array, float] | None:

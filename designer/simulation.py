@@ -34,6 +34,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
 from designer.gain.exact import Operator
+from designer.gain.noise import steady_state
 from designer.model.error_model import error_model, measurement_slices, stacked_gains
 from designer.workers import each
 
@@ -174,6 +175,15 @@ def simulate(
     if ensemble.refuted_at is None:
         return ensemble
     return replace(ensemble, rounding=_rounding(gains, network, found))
+
+
+def steady(gains: Gains) -> float | None:
+    """What E|z_tilde|^2 comes to under the problem's white noise; None: there is none, or the errors do not settle."""
+    problem, model = gains.problem, error_model(gains.problem, *stacked_gains(gains))
+    if not isinstance(problem.disturbance, White):
+        return None
+    found = steady_state(model, initial=problem.mode_index(problem.markov.initial))
+    return None if found is None else problem.disturbance.deviation**2 * found.total
 
 
 def network_of(gains: Gains, *, steps: int, w: Array | None = None) -> Network:

@@ -54,9 +54,10 @@ ROOMS = {
     "designer.problems": "",
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
+    "designer.beyond_gamma": "designer.gain designer.ladder designer.model",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
-    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
-    "designer.search",
+    "designer.analysis": "designer.beyond_gamma designer.diagnosis designer.gain designer.ladder designer.model "
+    "designer.proof designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
     "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
@@ -66,15 +67,16 @@ ROOMS = {
     "designer.ledger": "designer.gain designer.model designer.proof",
     "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
     "designer.identify": "designer.gain designer.model designer.replay",
-    "designer.report": "designer.ladder designer.model designer.proof designer.replay",
+    "designer.report": "designer.beyond_gamma designer.ladder designer.model designer.proof designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
-    "designer.show": "agent.contract.recording designer.problems",
-    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis designer.compare "
-    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
-    "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
-    "designer.simulation designer.sweep designer.synthesis designer.watch designer.what_if",
+    "designer.show": "agent.contract.recording designer.diagnosis designer.problems",
+    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis "
+    "designer.beyond_gamma designer.compare designer.diagnosis designer.export designer.gain designer.identify "
+    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
+    "designer.search designer.show designer.simulation designer.sweep designer.synthesis designer.watch "
+    "designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }

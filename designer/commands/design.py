@@ -117,6 +117,7 @@ def design_and_save(
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
+    from designer.beyond_gamma import beyond_gamma
     from designer.diagnosis import warnings
     from designer.ladder import ladder_of
     from designer.search.effort import BUDGET
@@ -146,6 +147,7 @@ def design_and_save(
         "exact": proved.exact,
         "floor": proved.floor,
         "ladder": ladder_of(gains).document(),
+        **beyond_gamma(problem, gains.K, gains.H).document(),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
@@ -188,14 +190,17 @@ def _chosen_method(problem: Problem, budget: float | None) -> str:
 
 def design_text(result: dict[str, Any]) -> str:
     """The facts of a design, for people."""
+    from designer.beyond_gamma import told
     from designer.ladder import Ladder, rounded_up
 
     solver = result["solver"]
     rungs = {name: result["ladder"][name] for name in Ladder._fields}
     ladder = "\n           ".join(Ladder(**rungs).lines())
+    beyond = "\n".join(told(result))
     return (
         f"{result['problem']} by {result['method']}: gamma = {rounded_up(result['gamma'])}, certified\n"
         f"ladder     {ladder}\n"
+        f"{beyond}\n"
         f"solver     {solver['name']} {solver['version']}: {solver['iterations']} iterations, "
         f"{result['seconds']['total']:.1f} s in all\n"
         f"status     {solver['status']}\n"

@@ -49,7 +49,8 @@ def simulate_command(options: argparse.Namespace) -> int:
     """`peakmesh simulate GAINS`.
 
     The object of --json: problem, runs, steps, seed, disturbance (its kind), gamma, claimed (whether the file's
-    certificate claims gamma), confidence (of all intervals at once);
+    certificate claims gamma), steady (what the mean square comes to in the steady state, computed, where the
+    disturbance is white; else null), confidence (of all intervals at once);
     peak and closest, each with step, mean_square (over runs, of |z_tilde(k)|^2), low and high (its interval), energy
     (of w before the step, in the mean over white noise), bound (gamma^2 energy) and least (what the true mean is at
     least, whatever the distribution): the step of the largest mean, and that where the mean is largest relative to
@@ -68,7 +69,7 @@ def simulate_command(options: argparse.Namespace) -> int:
     else:
         kind = gains.problem.disturbance.kind
     began = time.perf_counter()
-    from designer.simulation import simulate
+    from designer.simulation import simulate, steady
 
     ensemble = simulate(
         gains,
@@ -89,6 +90,7 @@ def simulate_command(options: argparse.Namespace) -> int:
         "seed": options.seed,
         "disturbance": kind,
         "claimed": gains.certificate.holds,
+        "steady": steady(gains) if kind == "white" else None,
         **_facts(ensemble),
         "seconds": time.perf_counter() - began,
         "output": None if options.output is None else str(options.output),
@@ -163,6 +165,8 @@ def _text(facts: dict[str, Any]) -> str:
         f"disturbance {facts['disturbance']}, {facts['seconds']:.1f} s",
         f"peak       {_interval(peak)}",
     ]
+    if facts["steady"] is not None:
+        lines += [f"steady     mean |z~|^2 = {facts['steady']:.6g} in the long run, computed from this white noise"]
     if closest is None:
         lines += ["bound      0: no disturbance comes before these steps, and gamma allows for no error without one"]
     else:

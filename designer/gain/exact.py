@@ -20,6 +20,7 @@ from designer.model.error_model import ErrorModel, LinkTerms
 from designer.model.units import natural_scale
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
+_WIDTH_OF_NODES = 1e-4
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
@@ -271,6 +272,25 @@ def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
     invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
     found = _bracket(operator, _MOST_STEPS, invariant, width)
     return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P[0], decays.radius)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def node_gains(model: ErrorModel) -> list[tuple[float, float]] | None:
+    """The exact gain to every node's own error z - z_hat_i, [low, high] each, with the gains of all as they are.
+
+    M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable.
+    """
+    operator = Operator(model)
+    P = invariants(operator.of, decay(operator.corner, model.modes, operator.units), operator.units, operator.MM)
+    if not P:
+        return None
+    invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
+    found = []
+    for M in np.split(model.M, len(model.rows)):
+        operator.MM = np.broadcast_to(M.T @ M, operator.MM.shape)
+        bracket = _bracket(operator, _MOST_STEPS, invariant, _WIDTH_OF_NODES)
+        found.append((math.sqrt(bracket.low), math.sqrt(bracket.high)))
+    return found
 
 
 @np.errstate(over="ignore", invalid="ignore")

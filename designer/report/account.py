@@ -14,6 +14,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.problem.disturbance import White
+from designer.beyond_gamma import BeyondGamma, beyond_gamma
 from designer.ladder import ladder_of
 from designer.replay import Report, judge
 from designer.replay.log import Log, load
@@ -156,6 +157,12 @@ class Account:
         if verdict.peak and verdict.energy and self.log.has_plant:
             rungs.append((THIS_RUN, verdict.peak.size / verdict.energy**0.5))
         return rungs
+
+    @cached_property
+    def beyond(self) -> BeyondGamma:
+        """What these gains do to each node by itself, and in noise."""
+        gains = self.log.gains
+        return beyond_gamma(gains.problem, gains.K, gains.H)
 
     @cached_property
     def mode_shares(self) -> Array:

@@ -503,7 +503,7 @@ def simulate_command(folder: Path, *arguments: object, gains: Gains) -> int:
 
 KEYS = {
     "problem", "runs", "steps", "seed", "disturbance", "gamma", "claimed", "confidence", "peak", "closest", "gain",
-    "refuted", "refuted_at", "single", "seconds", "output",
+    "refuted", "refuted_at", "single", "seconds", "steady", "output",
 }  # fmt: skip
 
 
@@ -534,6 +534,24 @@ def test_the_command_says_the_same_as_object_table_and_text(tmp_path: Path, caps
     assert f"mean |z~|^2 = {facts['peak']['mean_square']:.6g} at step {at}" in text
     assert f"{single['above']} of 300 runs exceed that; they may" in text
     assert "not refuted" in text
+
+
+def test_under_white_noise_the_steady_state_stands_beside_what_runs_came_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the deviation that the problem gives, and within the interval of the last step; under another w it is null."""
+    problem = sticky(disturbance={"kind": "white", "deviation": 3.0})
+    gains = uncertified(problem, case_of("sticky")[0].K, case_of("sticky")[0].H, method="none")
+    ensemble = simulation.simulate(gains, runs=400, steps=60, processes=1)
+    steady = simulation.steady(gains)
+    assert steady is not None
+    assert ensemble.low[-1] < steady < ensemble.high[-1]
+    simulate_command(tmp_path, "--runs", 20, "--steps", 60, "--json", gains=gains)
+    assert json.loads(capsys.readouterr().out)["steady"] == steady
+    simulate_command(tmp_path, "--runs", 20, "--steps", 60, gains=gains)
+    assert f"steady     mean |z~|^2 = {steady:.6g} in the long run" in capsys.readouterr().out
+    simulate_command(tmp_path, "--runs", 20, "--steps", 60, "--disturbance", "worst-case", "--json", gains=gains)
+    assert json.loads(capsys.readouterr().out)["steady"] is None
 
 
 def test_a_gamma_that_is_too_low_is_refuted_with_exit_code_1(

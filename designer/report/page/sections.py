@@ -21,6 +21,7 @@ MARKS = {"agrees": "✓", "agrees for what is there": "◐", "diverges": "✗", 
 VERSIONS = ("peakmesh", "python", "numpy", "eclipse-zenoh", "pydantic", "mcap")
 NODE_HEADS = (
     "node", "root mean square", "largest", "at step", "measurements lost", "by the model", "messages not used",
+    "its exact gain", "in white noise",
 )  # fmt: skip
 
 
@@ -122,11 +123,15 @@ def nodes(account: Account) -> str:
     if len(rows) > ROWS:
         table = f"<details><summary>All {len(rows)} nodes</summary>{table}</details>"
     what = "|z − ẑ|" if account.log.has_plant else "the distance from the median of all nodes"
-    about = f"<p>Of {what}, the largest root mean square first.</p>"
+    about = (
+        f"<p>Of {what}, the largest root mean square first. By the model, computed: the exact gain to each node's own "
+    )
+    about += "error, and its root mean square in the steady state under white w of unit covariance.</p>"
     return f'<section id="nodes"><h2>The nodes</h2>{about}{table}</section>'
 
 
 def _node_rows(account: Account) -> Iterator[str]:
+    noise, gains = account.beyond.noise, account.beyond.gains
     for i in account.ranking:
         node, lost = account.log.gains.problem.nodes[i], account.lost[:, i]
         sizes = np.nan_to_num(account.sizes[:, i])
@@ -137,6 +142,8 @@ def _node_rows(account: Account) -> Iterator[str]:
             f"{np.nanmean(lost):.1%}" if np.isfinite(lost).any() else "not known",
             f"{1.0 - node.arrival_probability:.1%}",
             f"{np.nansum(account.done_without[:, i]):.0f}",
+            "–" if gains is None else brief(gains[i][1], 3),
+            "–" if noise is None else brief(float(noise.nodes[i]) ** 0.5, 3),
         ]
         yield f'<tr><th scope="row">{escape(node.name)}</th>{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
 

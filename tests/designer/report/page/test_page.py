@@ -22,6 +22,7 @@ from designer.ladder import rounded_up
 from designer.report.account import Account
 from designer.report.page import CLOSE_UP, MOST_COLUMNS, page
 from designer.report.page.words import divergence_sentence, error_sentence, verdict_sentence
+from designer.report.scales import brief
 
 VOID = {"meta", "img", "input", "br", "path", "circle"}
 
@@ -90,6 +91,15 @@ def test_an_address_and_an_open_element_are_found() -> None:
     assert Checked("<div><p></p>").open == ["div"]
     with pytest.raises(AssertionError):
         Checked("<div><p></div>")
+
+
+def test_each_node_has_its_gain_and_its_noise(golden: Account) -> None:
+    """As computed for the gains of the recording."""
+    text, beyond = page(golden), golden.beyond
+    assert beyond.gains is not None
+    assert beyond.noise is not None
+    for (_, high), mean_square in zip(beyond.gains, beyond.noise.nodes, strict=True):
+        assert f"<td>{brief(high, 3)}</td><td>{brief(mean_square**0.5, 3)}</td></tr>" in text
 
 
 def test_the_numbers_for_the_pointer_are_the_recording(golden: Account) -> None:

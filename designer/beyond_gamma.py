@@ -1,0 +1,66 @@
+"""What gamma alone does not say of gains: what noise leaves in the errors, and how far each node's own error may go.
+
+Gamma is of the worst w and of all nodes together. Gains whose gamma is a little larger may let through half the noise.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from agent.contract.gains import LinkMatrices
+from agent.contract.problem import Problem
+from designer.gain.exact import node_gains
+from designer.gain.noise import SteadyState, steady_state
+from designer.ladder import rounded_up
+from designer.model.error_model import error_model, stacked_links
+
+_MOST_STATES = 40  # n nx up to which the gain of each node is worth its time
+_FEW = 8  # nodes that get a line each; of more, as many
+
+
+class BeyondGamma(NamedTuple):
+    """Of gains whose errors are mean-square stable; None where it was not computed, or has not settled."""
+
+    names: tuple[str, ...]
+    noise: SteadyState | None
+    gains: list[tuple[float, float]] | None  # of every node's own error
+
+    def document(self) -> dict[str, Any]:
+        """For --json."""
+        noise, gains = self.noise, self.gains
+        return {
+            "white_noise": None
+            if noise is None
+            else {
+                "covariance": "identity",
+                "mean_square": noise.total,
+                "nodes": dict(zip(self.names, noise.nodes.tolist(), strict=True)),
+                "relative_error": noise.error,
+            },
+            "node_gains": None if gains is None else dict(zip(self.names, map(list, gains), strict=True)),
+        }
+
+
+def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> BeyondGamma:
+    """For any gains; nothing is computed where the errors are not mean-square stable."""
+    model = error_model(problem, *stacked_links(problem, K, H))
+    noise = steady_state(model, initial=problem.mode_index(problem.markov.initial))
+    small = problem.n * problem.nx <= _MOST_STATES
+    return BeyondGamma(problem.node_names, noise, node_gains(model) if small else None)
+
+
+def told(facts: dict[str, Any]) -> list[str]:
+    """`BeyondGamma.document` for people: the noise, then a line for each node, of many for those that have most."""
+    noise, gains = facts["white_noise"], facts["node_gains"] or {}
+    if noise is None:
+        return ["noise      what white w leaves in the steady state was not found"]
+    found = [f"noise      E|z~|^2 = {noise['mean_square']:.6g} in the steady state under white w of unit covariance"]
+    order = sorted(noise["nodes"], key=lambda name: -noise["nodes"][name])
+    names = list(noise["nodes"]) if len(order) <= _FEW else order[:_FEW]
+    width = max(map(len, names))
+    for name in names:
+        gain = f"exact gain {rounded_up(gains[name][1])}, " if name in gains else ""
+        found.append(f"  node {name:{width}}  {gain}E|z - z^|^2 = {noise['nodes'][name]:.6g}; computed")
+    if len(order) > _FEW:
+        found.append(f"  and {len(order) - _FEW} nodes with less noise: --json has all")
+    return found
