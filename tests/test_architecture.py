@@ -71,7 +71,7 @@ ROOMS = {
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
-    "designer.show": "agent.contract.recording designer.diagnosis designer.problems",
+    "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis "
     "designer.beyond_gamma designer.compare designer.diagnosis designer.export designer.gain designer.identify "
     "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
