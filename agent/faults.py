@@ -141,12 +141,12 @@ def _probability(text: str, value: str) -> float:
 class Ordeal:
     """What participant `who` suffers from the faults of a run that it takes part in from step `begin` on."""
 
-    def __init__(self, faults: Iterable[Fault], who: str, *, begin: int) -> None:
-        """One that joins a run under way does not die of the same fault again."""
+    def __init__(self, faults: Iterable[Fault], who: str, *, begin: int, again: bool) -> None:
+        """One that joins a run under way, `again`, does not die of the same fault again, be it of step 0."""
         self._befalls = [
             fault
             for fault in faults
-            if fault.kind in ("kill", "freeze") and fault.who == who and (begin == 0 or fault.first > begin)
+            if fault.kind in ("kill", "freeze") and fault.who == who and not (again and fault.first <= begin)
         ]
 
     def due(self, step: int) -> list[Fault]:

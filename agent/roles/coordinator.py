@@ -138,6 +138,7 @@ class Conductor:
         self._started = False
         self._identity = os.urandom(8).hex()
         self._register = Register()  # of what was refused
+        self._again = False  # there was a coordinator before this one
         self._recorded = 0  # steps whose modes the recorder has, in a paced run that is taken up again
         if plan.needs_no_plant(gains.problem):
             self._everybody.remove(PLANT)
@@ -163,6 +164,7 @@ class Conductor:
         self._refuse_other_gains(answers)
         self._identity = first.identity
         self.complete = max(answer.step for answer in answers.values())
+        self._again = True
         self._order("start")
         greeting = self._bus.greeted(seconds=self._bus.network.wait, heed=self._welcome)
         self._recorded = min(self.complete, greeting.steps)
@@ -210,7 +212,7 @@ class Conductor:
             self._tell_refused()
             self._report_progress()
 
-        timekeeper.keep_time(tick, first=self.complete, recorded=self._recorded)
+        timekeeper.keep_time(tick, first=self.complete, recorded=self._recorded, again=self._again)
 
     def heed(self, word: Incoming) -> None:
         """What is heard in a paced run: who comes and goes, and what becomes of the recording."""

@@ -60,7 +60,7 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
         )
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         arriving = Arriving(faults, problem, node, seed=start.seed)
-        ordeal = Ordeal(faults, node_who(node), begin=start.step)
+        ordeal = Ordeal(faults, node_who(node), begin=start.step, again=bus.is_late)
         arrivals = Arrivals(
             [gate.arrived for gate in (modes, measurements, *estimates.values())],
             in_thread=bus.in_thread,

@@ -31,7 +31,7 @@ def run(bus: Bus, gains: Gains) -> None:
     def work(start: Control) -> None:
         plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case)
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
-        ordeal = Ordeal(faults, PLANT, begin=start.step)
+        ordeal = Ordeal(faults, PLANT, begin=start.step, again=bus.is_late)
         if start.period:
             bus.trace()
         while True:

@@ -64,7 +64,7 @@ def run(
     facts, paced = cut.run if cut is not None else _facts(bus.run, gains, start), start.period > 0.0
     with Record(path, run=facts, gains=gains, force=force, split=split, paced=paced, cut=cut) as record:
         faults = [parse(text, gains.problem, steps=start.steps) for text in start.faults]
-        ordeal = Ordeal(faults, RECORDER, begin=start.step) if paced else None
+        ordeal = Ordeal(faults, RECORDER, begin=start.step, again=bus.is_late) if paced else None
         recorder = Recorder(
             bus,
             channels,

@@ -86,15 +86,18 @@ def test_what_is_impossible_is_refused_in_a_sentence(text: str, why: str) -> Non
 def test_what_befalls_a_process_does_so_once() -> None:
     """At its step, or where that was missed at the next one; and not again to the process that follows."""
     faults = [fault("kill:node=n1,step=10"), fault("freeze:node=n1,step=20,for=1s"), fault("kill:plant,step=10")]
-    first = Ordeal(faults, "node-n1", begin=0)
+    first = Ordeal(faults, "node-n1", begin=0, again=False)
     assert first.due(9) == []
     assert first.due(11) == [faults[0]]
     assert first.due(12) == []
-    again = Ordeal(faults, "node-n1", begin=11)
+    again = Ordeal(faults, "node-n1", begin=11, again=True)
     assert again.due(15) == []
     assert again.due(20) == [faults[1]]
-    assert Ordeal(faults, "plant", begin=10).due(100) == []
-    assert Ordeal(faults, "node-n2", begin=0).due(100) == []
+    assert Ordeal(faults, "plant", begin=10, again=True).due(100) == []
+    assert Ordeal(faults, "node-n2", begin=0, again=False).due(100) == []
+    at_once = [fault("kill:coordinator,step=0")]
+    assert Ordeal(at_once, "coordinator", begin=0, again=False).due(0) == at_once
+    assert Ordeal(at_once, "coordinator", begin=0, again=True).due(0) == []
 
 
 def test_a_muted_link_is_muted_one_way_and_for_its_steps() -> None:

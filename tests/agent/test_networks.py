@@ -381,3 +381,13 @@ def test_a_recorder_may_be_killed_twice() -> None:
             assert len(files_of(outcome.recording)) == 3
             assert outcome.unrecorded == []
             assert broken(outcome) == []
+
+
+def test_a_coordinator_killed_at_step_0_has_a_successor_that_is_not() -> None:
+    """The run goes on at step 0, of which nobody has had a mode; the same fault does not befall whoever comes next."""
+    for seed in range(3):
+        with simulated(replace(asked(faults=(f"kill:{COORDINATOR},step=0",)), seed=seed)) as outcome:
+            assert len(processes(outcome, COORDINATOR)) == 2
+            assert outcome.summary is not None
+            assert sorted(set(steps_of(outcome, MODE))) == list(range(STEPS))
+            assert broken(outcome) == []
