@@ -21,6 +21,7 @@ from agent.plan import Plan
 from agent.roles.suffering import suffer
 
 TOO_LATE = 0.5  # part of all pairs; a run with more of them is none
+BUSY = 0.5  # part of a period that all processors are at work on a step; where they are less, they are not too slow
 LISTEN_SECONDS = 0.05  # after so long without a word, it looks for accounts
 ACCOUNT_SECONDS = 5.0  # after the last step the nodes have so long to tell how it went
 
@@ -34,18 +35,20 @@ class Timekeeper:
         assert plan.pace is not None
         self._bus, self._gains, self._plan, self._pace = bus, gains, plan, plan.pace
         self._heed, self._stood = heed, stood
-        self._accounts: dict[str, Account] = {}
+        self._first_accounts: dict[str, Account] = {}
+        self._accounts: dict[str, Account] = {}  # the last of each
         self._telling = bus.channel(ACCOUNT)
         self._is_judged = False  # whether the nodes can follow
 
-    def keep_time(self, tick: Callable[[int], None], *, first: int, recorded: int) -> None:
+    def keep_time(self, tick: Callable[[int], None], *, first: int, recorded: int, again: bool) -> None:
         """The modes from step `first` on, one a period; `tick` is called with each.
 
         Those from step `recorded` to `first` have been given out, but the recorder has not got them: once more.
+        `again`: by a coordinator before this one.
         """
         problem, plan = self._gains.problem, self._plan
         faults = [parse(text, problem, steps=plan.steps) for text in plan.faults]
-        ordeal = Ordeal(faults, COORDINATOR, begin=first)
+        ordeal = Ordeal(faults, COORDINATOR, begin=first, again=again)
         beat = Beat(period=self._pace.period, begin=time.monotonic() + self._pace.period, first=first)
         chain = islice(modes(problem, seed=plan.seed), recorded, plan.steps)
         for step, mode in enumerate(chain, recorded):
@@ -73,21 +76,32 @@ class Timekeeper:
         }
 
     def _refuse_haste(self, step: int) -> None:
-        """RunBroken where most of what the nodes tell soon after the beginning was too late, though nobody wills it."""
-        if self._is_judged or self._plan.faults:
+        """RunBroken where most of what the nodes tell soon after the beginning was too late, though nobody wills it.
+
+        And where that is for want of processors: while the network or somebody is out, they have nothing to do.
+        """
+        before, after, nodes = self._first_accounts, self._accounts, self._gains.problem.n
+        if self._is_judged or self._plan.faults or len(before) < nodes:
             return
-        accounts, nodes = list(self._accounts.values()), self._gains.problem.n
-        if len(accounts) < nodes:
+        told = [(before[who], after[who]) for who in before]
+        if any(one.step == other.step for one, other in told):
             return
         self._is_judged = True
-        pairs, late = (sum(getattr(one, name) for one in accounts) for name in ("pairs", "pairs_substituted"))
-        if late <= TOO_LATE * pairs:
+        steps, pairs, late, processor = (
+            [getattr(other, name) - getattr(one, name) for one, other in told]
+            for name in ("step", "pairs", "pairs_substituted", "processor")
+        )
+        if min(steps) < 0 or min(pairs) < 0 or sum(late) <= TOO_LATE * sum(pairs):
             return
-        of_node = sum(account.processor / (account.step + 1) for account in accounts) / nodes
-        able = max(2.0 * self._pace.period, 2.0 * (nodes + 2) * of_node / (os.cpu_count() or 1))
+        of_node = sum(seconds / made for seconds, made in zip(processor, steps, strict=True)) / nodes
+        needed = (nodes + 2) * of_node / (os.cpu_count() or 1)  # s a step, if plant and recorder need as much
+        if needed < BUSY * self._pace.period:
+            return
+        able = max(2.0 * self._pace.period, 2.0 * needed)
         raise RunBroken(
-            f"a period of {1e3 * self._pace.period:g} ms is shorter than this machine can hold: in {step + 1} steps "
-            f"{late / pairs:.0%} of what nodes should have heard came too late; try --period {1e3 * able:.0f}ms"
+            f"a period of {1e3 * self._pace.period:g} ms is shorter than this machine can hold: of the first {step + 1} "
+            f"steps {sum(late) / sum(pairs):.0%} of what nodes should have heard came too late, and a step takes "
+            f"{1e3 * needed:.2g} ms of all its processors; try --period {1e3 * able:.0f}ms"
         )
 
     def _listen(self, deadline: float, *, until: Callable[[], bool] = lambda: False) -> None:
@@ -108,3 +122,4 @@ class Timekeeper:
         for admitted in self._telling.waiting():
             if isinstance(account := admitted.message, Account):
                 self._accounts[account.who] = account
+                self._first_accounts.setdefault(account.who, account)

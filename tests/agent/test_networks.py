@@ -36,11 +36,12 @@ from agent.network.bus import Bus
 from agent.network.words import Refused
 from agent.pacing import beat
 from agent.plan import Pace, Plan
-from agent.roles import coordinator, node, suffering
+from agent.roles import coordinator, node, suffering, timekeeper
 from designer.replay import replay
 
 SEEDS, BLOCK = 200, 25
 GAINS = random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
+TWO = random_gains(random_problem(11, ny=(1, 2), modes=2))
 STEPS = 20
 
 
@@ -391,3 +392,18 @@ def test_a_coordinator_killed_at_step_0_has_a_successor_that_is_not() -> None:
             assert outcome.summary is not None
             assert sorted(set(steps_of(outcome, MODE))) == list(range(STEPS))
             assert broken(outcome) == []
+
+
+@pytest.mark.parametrize(("who", "at"), [("node-n0", 0.02), ("node-n0", 0.25), (COORDINATOR, 0.25)])
+def test_an_outage_at_the_beginning_is_not_a_machine_that_is_too_slow(
+    monkeypatch: pytest.MonkeyPatch, who: str, at: float
+) -> None:
+    """Most of what the nodes should have heard is late, and none of them has anything to do."""
+    calm = asked(Trouble("part", who, at, 8.0))
+    outage = replace(calm, gains=TWO, plan=replace(calm.plan, steps=150))
+    with simulated(outage) as outcome:
+        assert outcome.summary is not None
+        assert broken(outcome) == []
+    monkeypatch.setattr(timekeeper, "BUSY", 0.0)
+    with simulated(outage) as outcome:
+        assert "shorter than this machine can hold" in processes(outcome, COORDINATOR)[0].error.args[0]  # type: ignore[union-attr]

@@ -67,7 +67,7 @@ def kept(
     wire.more = more or []
     plan = Plan(steps, seed=1, pace=PACE, faults=faults)
     keeper = Timekeeper(wire, gains, plan, heed=lambda word: None, stood=lambda seconds: None)  # type: ignore[arg-type]
-    keeper.keep_time(lambda step: None, first=first, recorded=recorded)
+    keeper.keep_time(lambda step: None, first=first, recorded=recorded, again=first > 0)
     return wire
 
 
@@ -82,23 +82,49 @@ def test_who_goes_on_gives_out_the_same_chain(gains: Gains) -> None:
     assert kept(gains, [], first=23, recorded=20, steps=40).sent == whole[20:]
 
 
+def second(accounts: list[Account], *, late: int, processor: float) -> list[Account]:
+    """What the same nodes tell a hundred steps later, of which `late` pairs in a hundred were late."""
+    return [
+        one.model_copy(
+            update={
+                "step": one.step + 100,
+                "pairs": one.pairs + 100,
+                "pairs_substituted": one.pairs_substituted + late,
+                "processor": one.processor + processor,
+            }
+        )
+        for one in accounts
+    ]
+
+
 def test_a_period_that_is_too_short_is_refused_with_one_that_is_not(gains: Gains) -> None:
+    accounts = everybody(gains, substituted=80)
     with pytest.raises(RunBroken) as caught:
-        kept(gains, everybody(gains, substituted=80))
-    assert str(caught.value).startswith("a period of 1 ms is shorter than this machine can hold: in 1 steps 80% of ")
-    able = int(str(caught.value).rpartition("--period ")[2].removesuffix("ms"))
-    assert able >= 2
+        kept(gains, [*second(accounts, late=80, processor=1.0), *accounts])  # the last is the first to be taken
+    sentence = str(caught.value)
+    assert sentence.startswith("a period of 1 ms is shorter than this machine can hold: of the first 1 steps 80% of ")
+    assert int(sentence.rpartition("--period ")[2].removesuffix("ms")) >= 2
 
 
-@pytest.mark.parametrize("substituted", [0, 50])
-def test_a_period_that_is_long_enough_is_not(gains: Gains, substituted: int) -> None:
-    assert len(kept(gains, everybody(gains, substituted=substituted)).sent) == 5
+@pytest.mark.parametrize(("late", "processor"), [(0, 1.0), (50, 1.0), (100, 0.001)])
+def test_a_period_that_is_long_enough_is_not(gains: Gains, late: int, processor: float) -> None:
+    """Where everything is late, and nobody has anything to do, something else is out than the machine."""
+    accounts = everybody(gains, substituted=100)  # what was late at the beginning is nobody's measure
+    assert len(kept(gains, [*second(accounts, late=late, processor=processor), *accounts]).sent) == 5
 
 
 def test_one_node_that_is_late_does_not_make_a_period_too_short(gains: Gains) -> None:
     accounts = everybody(gains, substituted=0)
-    accounts[0] = accounts[0].model_copy(update={"pairs_substituted": 100})
-    assert len(kept(gains, accounts).sent) == 5
+    later = second(accounts, late=0, processor=1.0)
+    later[0] = second(accounts[:1], late=100, processor=1.0)[0]
+    assert len(kept(gains, [*later, *accounts]).sent) == 5
+
+
+def test_a_node_that_counts_anew_is_no_measure(gains: Gains) -> None:
+    accounts = everybody(gains, substituted=0)
+    later = second(accounts, late=100, processor=1.0)
+    later[0] = later[0].model_copy(update={"pairs": 1, "pairs_substituted": 1, "processor": 0.01})
+    assert len(kept(gains, [*later, *accounts]).sent) == 5
 
 
 @pytest.mark.parametrize("faults", [(), ("drop:probability=0.1",)])
