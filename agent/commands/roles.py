@@ -145,7 +145,7 @@ def coordinator_command(options: argparse.Namespace) -> int:
         _tell_supervisor(options, "the coordinator waits for everybody")
         summary = coordinator.run(bus, gains, plan, report=say)
     say({"summary": {key: value for key, value in summary._asdict().items() if value is not None}})
-    return EXIT_BROKEN if summary.broken_off else EXIT_GOOD
+    return EXIT_BROKEN if summary.broken_off or summary.not_whole else EXIT_GOOD
 
 
 def recorder_command(options: argparse.Namespace) -> int:

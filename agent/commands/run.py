@@ -58,8 +58,8 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def exit_code_of(result: dict[str, Any]) -> int:
-    """A run that was not recorded to its end is broken, also where it was allowed to go on."""
-    return EXIT_BROKEN if result["broken_off"] else EXIT_GOOD
+    """A run that was not recorded to its end is broken, also where it was allowed to go on, and of whomever."""
+    return EXIT_BROKEN if result["broken_off"] or result["not_whole"] else EXIT_GOOD
 
 
 def run_gains(

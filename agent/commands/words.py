@@ -33,8 +33,8 @@ def say_to_person(word: dict[str, Any]) -> None:
             print(f"{summary['steps']} steps, {summary['messages']} messages recorded")
             for line in refused_text(summary.get("refused", {})):
                 print(line)
-            if summary["broken_off"]:
-                print(f"NOT RECORDED TO THE END: {summary['broken_off']}")
+            if off := summary["broken_off"] or summary["not_whole"]:
+                print(f"NOT RECORDED TO THE END: {off}")
 
 
 def say_broken_off(sentence: object) -> None:
@@ -95,8 +95,8 @@ def run_text(result: dict[str, Any]) -> str:
         f"recording  {in_words(files)}",
         f"next       peakmesh replay {files[0]}",  # it finds the other parts beside it
     ]
-    if result["broken_off"]:
-        lines.insert(1, f"NOT RECORDED TO THE END: {result['broken_off']}")
+    if off := result["broken_off"] or result["not_whole"]:
+        lines.insert(1, f"NOT RECORDED TO THE END: {off}")
     if "pacing" in result:
         lines[1:1] = pacing_text(result["pacing"])
     if "refused" in result:

@@ -49,6 +49,7 @@ from agent.refusals import Register
 from agent.roles.timekeeper import Timekeeper
 
 REPORT_SECONDS = 0.1
+MOST_NAMED = 8
 TAKE_UP_SECONDS = 0.5  # a coordinator that has come back waits so long for others than the first who answers
 
 
@@ -61,6 +62,7 @@ class Summary(NamedTuple):
     missing: int
     recorded_steps: int  # all, unless the recording broke off
     broken_off: str  # why, and since when there is no recording; "" where there is a whole one
+    not_whole: str = ""  # who is not recorded to its last step, in a paced run; "" where everybody is
     pacing: dict[str, Any] | None = None  # of a paced run: what was substituted, and latencies in seconds
     refused: dict[str, Counts] | None = None  # messages that did not fit: by whom, on which topic, of which kind
 
@@ -119,6 +121,7 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
         missing=last_word.missing,
         recorded_steps=plan.steps if off is None else off.steps,
         broken_off="" if off is None else str(off),
+        not_whole="" if off is not None else conductor.who_is_not_whole(last_word),
         pacing=None if timekeeper is None else timekeeper.pacing(),
         refused=conductor.refused(),
     )
@@ -252,6 +255,18 @@ class Conductor:
         if last_word is None:
             raise RunBroken("all steps are done, but the recorder did not close the recording")
         return last_word
+
+    def who_is_not_whole(self, last_word: Acknowledged) -> str:
+        """Of whom the last steps are not recorded: they stood still, or were gone, as the run ended."""
+        reached = {who: last_word.reached.get(who, -1) for who in self._everybody if who != RECORDER}
+        short = [
+            f"of {in_words(who)} {f'after step {last}' if last >= 0 else 'at all'}"
+            for who, last in reached.items()
+            if last < self._plan.steps - 1
+        ]
+        more = f" and of {len(short) - MOST_NAMED} more" if len(short) > MOST_NAMED else ""
+        whom = ", ".join(short[:MOST_NAMED]) + more
+        return f"nothing is recorded {whom}; the last step is {self._plan.steps - 1}" if short else ""
 
     def stop(self, reason: str) -> Acknowledged | None:
         """Tell everybody why the run ends here, and wait for the recorder where there is something to close."""

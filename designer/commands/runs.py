@@ -63,7 +63,7 @@ def demo_command(options: argparse.Namespace) -> int:
     if options.json:
         done = {"design": designed, "run": ran, "replay": account.verdict.document(), "report": str(page)}
         print(json.dumps(done))
-    return account.verdict.exit_code
+    return account.verdict.exit_code or agent.commands.run.exit_code_of(ran)
 
 
 def _say(options: argparse.Namespace, text: str) -> None:

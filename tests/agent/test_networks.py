@@ -407,3 +407,26 @@ def test_an_outage_at_the_beginning_is_not_a_machine_that_is_too_slow(
     monkeypatch.setattr(timekeeper, "BUSY", 0.0)
     with simulated(outage) as outcome:
         assert "shorter than this machine can hold" in processes(outcome, COORDINATOR)[0].error.args[0]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        (f"freeze:node=n1,step={STEPS - 3},for=60s", f'of node "n1" after step {STEPS - 4}'),
+        (f"freeze:plant,step={STEPS - 3},for=60s", f"of the plant after step {STEPS - 4}"),
+        (f"kill:node=n1,step={STEPS - 1}", f'of node "n1" after step {STEPS - 2}'),
+    ],
+)
+def test_who_does_not_come_to_its_last_step_is_named(fault: str, sentence: str) -> None:
+    """Its messages are nobody's loss, for they were never published; but the run was not whole."""
+    with simulated(asked(faults=(fault,))) as outcome:
+        assert outcome.summary is not None
+        assert outcome.summary.not_whole == f"nothing is recorded {sentence}; the last step is {STEPS - 1}"
+        assert outcome.summary.missing == 0
+        assert broken(outcome) == []
+
+
+def test_who_wakes_up_in_time_is_whole() -> None:
+    with simulated(asked(faults=(f"freeze:node=n1,step={STEPS - 3},for=2s",))) as outcome:
+        assert outcome.summary is not None
+        assert outcome.summary.not_whole == ""
