@@ -100,8 +100,8 @@ class Timekeeper:
         able = max(2.0 * self._pace.period, 2.0 * needed)
         raise RunBroken(
             f"a period of {1e3 * self._pace.period:g} ms is shorter than this machine can hold: of the first "
-            f"{step + 1} steps {sum(late) / sum(pairs):.0%} of what nodes should have heard came too late, and a step takes "
-            f"{1e3 * needed:.2g} ms of all its processors; try --period {1e3 * able:.0f}ms"
+            f"{step + 1} steps {sum(late) / sum(pairs):.0%} of what nodes should have heard came too late, and a step "
+            f"takes {1e3 * needed:.2g} ms of all its processors; try --period {1e3 * able:.0f}ms"
         )
 
     def _listen(self, deadline: float, *, until: Callable[[], bool] = lambda: False) -> None:
