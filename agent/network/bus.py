@@ -84,6 +84,7 @@ from agent.signals import Handler, Handlers, heed, restore
 REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
 CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
 LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
+FAREWELL_SECONDS = 2.0  # for the recorder to have our messages, for who is asked to go while the run goes on
 EXCUSE_SECONDS = 2.0  # for the coordinator to be there, for who cannot take part
 THREAD_SECONDS = 5.0  # for a thread to end once the session is closed
 GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
@@ -460,6 +461,15 @@ class Bus:
         for word in self._until(lambda: self._last_word is not None or not keepers & present, silence=CLOSE_SECONDS):
             heed(word)
         return self._last_word
+
+    def wait_until_recorded(self) -> None:
+        """Publish nothing more, and stay until the recorder has what we have published; but not for long.
+
+        Nobody else keeps it, and the recorder may just be on its way back, to ask for it.
+        """
+        self.is_over, deadline = True, time.monotonic() + FAREWELL_SECONDS
+        for _ in self._until(lambda: not self.unrecorded or time.monotonic() >= deadline, silence=FAREWELL_SECONDS):
+            pass
 
     def wait_until_there(self, whos: Iterable[str]) -> None:
         """Wait for those who have not been seen yet; but not for long, for they may be gone."""

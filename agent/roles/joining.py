@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from importlib.metadata import version
 
-from agent.contract.errors import InputError, RecordingFailed, RunBroken, counted
+from agent.contract.errors import InputError, Interrupted, RecordingFailed, RunBroken, counted
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words
 from agent.contract.messages import Control
@@ -74,6 +74,11 @@ def take_part(bus: Bus, gains: Gains, work: Callable[[Control], None]) -> None:
     try:
         while True:
             bus.receive()
+    except Interrupted as asked:
+        bus.wait_until_recorded()
+        if bus.unrecorded:
+            asked.args = (f"{asked}; the recorder has not got {counted(bus.unrecorded, 'message')} of ours",)
+        raise
     except RunClosed as closed:
         bus.is_over = True
         last_word = bus.wait_for_close()

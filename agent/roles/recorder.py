@@ -134,6 +134,8 @@ class Recorder:
                         self._greet(who)
                 case Peer(who=who, present=False):
                     self._sessions.pop(who, None)
+                case Peer(who=who) if self._is_late and who in self._publishers:
+                    self._ask(who)  # it was not there to be asked with everybody
             pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
@@ -215,7 +217,10 @@ class Recorder:
     def _ask_everybody(self) -> None:
         """For the messages that we do not hold; they come as samples."""
         for who in self._publishers:
-            self._bus.request_replay(who, first=self._record.receipts.received.get(who, 0))
+            self._ask(who)
+
+    def _ask(self, who: str) -> None:
+        self._bus.request_replay(who, first=self._record.receipts.received.get(who, 0))
 
     def _acknowledge(self, *, lacking: list[str] | None = None, closed: bool = False, greets: str = "") -> None:
         receipts = self._record.receipts

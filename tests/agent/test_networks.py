@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -432,3 +433,23 @@ def test_who_wakes_up_in_time_is_whole() -> None:
     with simulated(asked(faults=(f"freeze:node=n1,step={STEPS - 3},for=2s",))) as outcome:
         assert outcome.summary is not None
         assert outcome.summary.not_whole == ""
+
+
+@pytest.mark.parametrize("who", ["node-n1", PLANT])
+@pytest.mark.parametrize("faults", [(), ("kill:recorder,step=7",)], ids=["", "recorder away"])
+def test_a_publisher_that_is_asked_to_go_waits_for_the_recorder(who: str, faults: tuple[str, ...]) -> None:
+    """SIGTERM in the middle of a paced run: what it has published is nowhere else, and a recorder may be on its way."""
+    for seed in range(2):
+        with simulated(replace(asked(Trouble("signal", who, 0.45), faults=faults), seed=seed)) as outcome:
+            assert outcome.unrecorded == []
+            assert str(processes(outcome, who)[0].error) == "terminated"
+            assert broken(outcome) == []
+
+
+def test_a_publisher_that_is_asked_to_go_waits_for_no_recorder_that_stays_away() -> None:
+    """It says what is lost with it."""
+    frozen = f"freeze:{RECORDER},step=7,for=9s"
+    with simulated(asked(Trouble("signal", "node-n1", 0.6), faults=(frozen,))) as outcome:
+        first = processes(outcome, "node-n1")[0]
+        assert re.fullmatch(r"terminated; the recorder has not got \d+ messages of ours", str(first.error))
+        assert broken(outcome) == []
