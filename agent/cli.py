@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     open_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
-    parser = argparse.ArgumentParser(prog="peakmesh", description=__doc__)
+    parser = argparse.ArgumentParser(prog="peakmesh", description=__doc__, allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     run.add_run(commands)
     roles.add_roles(commands, {} if "--child" in words else os.environ)  # a launcher says all to its children

@@ -39,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     agent.cli.open_streams()
     parser = argparse.ArgumentParser(
         prog="peakmesh",
+        allow_abbrev=False,
         description="Design, run and audit distributed peak-error filters.",
         epilog="Exit codes: 0 good; 1 the answer is no; 2 bad input; 3 the run broke; 129, 130 or 143 by a signal.",
     )

@@ -13,6 +13,7 @@ from agent.contract.gains import Gains
 from agent.contract.keys import EVIDENCE
 from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
+from agent.contract.recording.contents import number
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
 from designer.problems import find, is_another, text_of
@@ -216,9 +217,9 @@ def _recording(reader: RecordingReader, report: Progress | None) -> dict[str, An
         "size": "" if gains is None else _size(gains.problem),
         "gains": run.get("gains", "") if gains is None else gains.digest(),
         **({} if gains is None else {"gamma": gains.certificate.gamma, "holds": gains.certificate.holds}),
-        "seed": run.get("seed", ""),
-        "steps": run.get("steps", ""),
-        "complete_steps": end.get("steps"),
+        "seed": number(run.get("seed", "")),
+        "steps": number(run.get("steps", "")),
+        "complete_steps": number(end["steps"]) if "steps" in end else None,
         "external": [name for name in run.get("external", "").split(",") if name],
         "started": run.get("started", ""),
         "messages": dict(sorted(counts.items())),

@@ -29,7 +29,9 @@ def _load(path: str) -> Problem:
 
 def add_keys(commands: Subcommands, *, find: Callable[[str], Problem] = _load, about: str = "problem file") -> None:
     """Describe `keys` to the parser; `find` reads what the option --problem takes, which `about` says."""
-    keys = commands.add_parser("keys", help="certificates, so that nobody else can take part or say anything")
+    keys = commands.add_parser(
+        "keys", help="certificates, so that nobody else can take part or say anything", allow_abbrev=False
+    )
     actions = keys.add_subparsers(dest="action", required=True, metavar="ACTION")
     init = add_command(actions, "init", init_command, "make an authority, and a certificate for everybody")
     init.add_argument("--problem", required=True, metavar="PROBLEM", help=about)

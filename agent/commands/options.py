@@ -24,7 +24,7 @@ def add_command(
     commands: Subcommands, name: str, call: Callable[[argparse.Namespace], int], about: str
 ) -> argparse.ArgumentParser:
     """Add a command that `perform` will call."""
-    parser = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+    parser = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.", allow_abbrev=False)
     parser.set_defaults(call=call)
     parser.add_argument("-v", "--verbose", action="store_true", help="show where an error came from")
     return parser

@@ -74,7 +74,8 @@ def run_gains(
     recording = options.output or default_recording(run)
     refuse_recording(recording, force=options.force)
     keys = "" if options.keys is None else f" --keys {options.keys}"
-    with progress(plan.steps, live=f"peakmesh live {path} --run {run}{keys}") as report:
+    live = f"peakmesh live {path} --run {run}{keys}"
+    with progress(plan.steps, live=live, run=run, external=plan.external) as report:
         summary = launch(
             path,
             gains,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -48,10 +48,12 @@ def say_warning(sentence: object) -> None:
 
 
 @contextmanager
-def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+def progress(
+    steps: int, *, live: str, run: str, external: Sequence[str] = ()
+) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar on stderr, where that is a terminal; the function takes the coordinator's words.
 
-    `live` is the command that looks on, but for the address.
+    `live` is the command that looks on, but for the address; who starts sensors of `external` nodes is told both.
     """
 
     def warn(word: dict[str, Any]) -> None:
@@ -59,6 +61,13 @@ def progress(steps: int, *, live: str) -> Iterator[Callable[[dict[str, Any]], No
             say_broken_off(word["broken_off"])
         if "warning" in word:
             say_warning(word["warning"])
+        if "listening" in word:
+            for node in external:
+                print(
+                    f'node "{node}" waits for its sensor: run {run}, address {word["listening"][0]}',
+                    file=sys.stderr,
+                    flush=True,
+                )
 
     if not sys.stderr.isatty():
         yield warn

@@ -12,10 +12,13 @@ A message is one sentence that says what, where, the value, and what would be ri
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from typing import Any, TypeAlias
 
 from pydantic import ValidationError
+
+Location: TypeAlias = "tuple[int | str, ...]"  # of a value in a document, as pydantic gives it
 
 EXIT_GOOD = 0
 EXIT_NO = 1
@@ -72,10 +75,11 @@ def listed(names: Iterable[str]) -> str:
     return " and ".join([", ".join(quoted[:-1]), quoted[-1]] if len(quoted) > 1 else quoted)
 
 
-def first_fault(error: ValidationError, document: Any) -> str:
+def first_fault(error: ValidationError, document: Any, known: Callable[[Location], Iterable[str]] | None = None) -> str:
     """The first fault pydantic found, as one sentence that names the place by its name, not its index.
 
-    An unknown key comes first: it is mostly the misspelling of one that is then reported as missing.
+    An unknown key comes first: it is mostly the misspelling of one that is then reported as missing, or of an optional
+    one; `known` tells what keys the table at a location may have.
     """
     faults = error.errors(include_url=False)
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
@@ -85,7 +89,9 @@ def first_fault(error: ValidationError, document: Any) -> str:
             return f'{place}"{fault["loc"][-1]}" is missing'
         case "extra_forbidden":
             absent = [str(f["loc"][-1]) for f in faults if f["type"] == "missing"]
-            hint = f"; {listed(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else ""
+            near = get_close_matches(str(fault["loc"][-1]), known(fault["loc"][:-1]) if known else (), n=1)
+            hint = f'; did you mean "{near[0]}"?' if near else ""
+            hint = f"; {listed(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else hint
             return f"{place}this key is not known here{hint}"
         case "value_error":
             return f"{place}{fault['ctx']['error']}"
@@ -119,7 +125,7 @@ _WANTED = {  # what pydantic asks for, as a person says it who writes TOML
 }
 
 
-def _place(location: tuple[int | str, ...], document: Any) -> str:
+def _place(location: Location, document: Any) -> str:
     """'node "2": C: ' for ("node", 1, "C")."""
     words: list[str] = []
     here = document

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NoReturn, Self
+from collections.abc import Iterator, Mapping
+from typing import Any, NoReturn, Self, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from agent.contract.errors import InputError, first_fault, listed
+from agent.contract.errors import InputError, Location, first_fault, listed
 
 
 class Frozen(BaseModel):
@@ -33,7 +33,17 @@ class Frozen(BaseModel):
         try:
             return cls.model_validate(document)
         except ValidationError as error:
-            raise InputError(first_fault(error, document)) from None
+            raise InputError(first_fault(error, document, cls.keys_at)) from None
+
+    @classmethod
+    def keys_at(cls, location: Location) -> set[str]:
+        """The keys that the table at a location of a document may have."""
+        kinds: set[type[BaseModel]] = {cls}
+        for step in location:
+            fields = {field.alias or name: field for kind in kinds for name, field in kind.model_fields.items()}
+            if step in fields:  # else it is the index in a list, or the tag of a union
+                kinds = set(_models_in(fields[str(step)].annotation))
+        return {field.alias or name for kind in kinds for name, field in kind.model_fields.items()}
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """The same with other values of some fields; `deep` or not, nothing is shared. Raises InputError."""
@@ -58,6 +68,14 @@ class Frozen(BaseModel):
 
     def copy(self, **options: Any) -> NoReturn:
         raise TypeError("copy is pydantic 1, and does not validate; call model_copy(update={...})")
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that a field of this type may hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models_in(part)
 
 
 def _plain(value: Any) -> Any:

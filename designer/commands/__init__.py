@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+from agent.contract.errors import InputError
 
 if TYPE_CHECKING:
     from agent.contract.problem import Problem
@@ -28,6 +31,19 @@ def add_set(parser: argparse.ArgumentParser, *, also: str = "") -> None:
         help="another value in the problem, such as 'node.*.arrival_probability=0.7' or plant.A.1.2=0.1, rows and "
         f"columns counted from 1; may be repeated{also}",
     )
+
+
+def find_to_design(text: str, settings: Sequence[str] = ()) -> Problem:
+    """The problem that `text` names, which has something to estimate. InputError, with that name in it, otherwise."""
+    from designer.diagnosis import refuse_nothing_to_estimate
+    from designer.problems import find
+
+    problem = find(text, settings)
+    try:
+        refuse_nothing_to_estimate(problem)
+    except InputError as error:
+        raise InputError(f"{text}: {error}") from None
+    return problem
 
 
 def tell_notes(problem: Problem) -> list[str]:

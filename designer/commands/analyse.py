@@ -9,7 +9,7 @@ from pathlib import Path
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, add_set, tell_notes
+from designer.commands import PROBLEM, add_set, find_to_design, tell_notes
 
 
 def add_analyse(commands: Subcommands) -> None:
@@ -33,9 +33,8 @@ def analyse_command(options: argparse.Namespace) -> int:
     """`peakmesh analyse PROBLEM --gains FILE`: exit code 1 where the errors are not mean-square stable."""
     from designer.analysis import analyse, certified, load_given
     from designer.ladder import rounded_up
-    from designer.problems import find
 
-    problem = find(options.problem, options.settings)
+    problem = find_to_design(options.problem, options.settings)
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
     given = load_given(options.gains, problem)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, add_set, tell_notes
+from designer.commands import PROBLEM, add_set, find_to_design, tell_notes
 from designer.commands.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -80,9 +80,9 @@ def duration(text: str) -> float:
 
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
-    from designer.problems import find
 
-    problem = _what_is_left(find(options.problem, options.settings), options.without_node, options.without_link)
+    problem = find_to_design(options.problem, options.settings)
+    problem = _what_is_left(problem, options.without_node, options.without_link)
     if options.price:
         return _price_command(problem, options)
     _, result = design_and_save(

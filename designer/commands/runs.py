@@ -21,7 +21,7 @@ from agent.commands.options import (
 from agent.commands.words import run_text
 from agent.contract.errors import InputError, RecordingFailed
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, add_set
+from designer.commands import PROBLEM, add_set, find_to_design
 from designer.commands.design import add_method, design_and_save, design_text
 from designer.commands.report import write_page
 
@@ -37,10 +37,9 @@ def add_demo(commands: Subcommands) -> None:
 
 def demo_command(options: argparse.Namespace) -> int:
     """`peakmesh demo`: the whole job; its files go to a folder of their own."""
-    from designer.problems import find
     from designer.report.account import Account
 
-    problem = find(options.problem, options.settings)
+    problem = find_to_design(options.problem, options.settings)
     folder = options.output or Path("recordings") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; --output takes the folder for the demo's files")
@@ -95,9 +94,8 @@ def run_command(options: argparse.Namespace) -> int:
         return _tell(ran, options)
     from agent.contract.recording.parts import refuse_recording
     from designer.ladder import rounded_up
-    from designer.problems import find
 
-    problem = find(options.gains, options.settings)
+    problem = find_to_design(options.gains, options.settings)
     if options.output is None:
         options.output = default_recording(f"{problem.name}-{datetime.now():%Y%m%d-%H%M%S}")
     refuse_recording(options.output, force=options.force)

@@ -60,7 +60,8 @@ def verify_command(options: argparse.Namespace) -> int:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
     if options.json:
         said = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
-        print(json.dumps(verdict._asdict() | said | _of_problem(gains) | {"claimed": _claimed(gains, verdict.low)}))
+        of = _of_problem(gains, options.gains)
+        print(json.dumps(verdict._asdict() | said | of | {"claimed": _claimed(gains, verdict.low)}))
         return EXIT_GOOD if verdict.holds else EXIT_NO
     lines = [f"of      {text}" for text in _whose(gains, differs)]
     if verdict.holds:
@@ -88,16 +89,18 @@ def _for_another(gains: Gains, options: argparse.Namespace, differs: list[str]) 
         f"{'differ' if len(differs) > 1 else 'differs'}; {_whose(gains, [])[0]}"
     )
     if options.json:
-        print(json.dumps({"holds": False, "gamma": gains.certificate.gamma, "failure": why, **_of_problem(gains)}))
+        of = _of_problem(gains, options.gains)
+        print(json.dumps({"holds": False, "gamma": gains.certificate.gamma, "failure": why, **of}))
     else:
         print(f"does not hold: {options.gains} proves nothing of {options.problem}: {why}")
     return EXIT_NO
 
 
-def _of_problem(gains: Gains) -> dict[str, object]:
+def _of_problem(gains: Gains, path: Path) -> dict[str, object]:
     from designer.problems import is_another
 
     return {
+        "file": str(path),
         "problem": gains.problem.name,
         "problem_digest": gains.problem_digest,
         "is_another": is_another(gains.problem),

@@ -17,6 +17,7 @@ from agent.contract.arrays import ulps
 from agent.contract.errors import RunBroken
 from agent.contract.keys import BESIDE, MODE, PLANT_STATE, decode, model_of
 from agent.contract.recording import Logged
+from agent.contract.recording.contents import number
 from agent.contract.recording.reader import RecordingReader
 from designer.compare.comparison import Comparison, Difference, Gap
 
@@ -41,8 +42,8 @@ def _facts(reader: RecordingReader) -> dict[str, Any]:
     return {
         "problem": f"{gains.problem.name} ({gains.problem_digest[:12]}...)",
         "gains": f"{gains.method} ({gains.digest()[:12]}...)",
-        "seed": run.get("seed", ""),
-        "steps": run.get("steps", ""),
+        "seed": number(run.get("seed", "")),
+        "steps": number(run.get("steps", "")),
         "external": run.get("external", "") or "no node",
         "end": f"{end.get('status', '')} {end.get('steps', '')}".strip(),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -107,3 +108,30 @@ def test_a_forgotten_external_is_warned_of(pair_path: Path, tmp_path: Path, pair
             process.wait()
         waiting.join()
     assert warned.is_set()
+
+
+def test_run_tells_where_the_sensor_is_to_connect(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
+    """`peakmesh run --external`: the run's name and the address, on stderr, before it waits; they are all it needs."""
+    name, recording = pair.problem.node_names[0], tmp_path / "run.mcap"
+    words = ["run", pair_path, "--external", name, "--steps", "20", "--wait", str(PATIENCE), "-o", recording]
+    with subprocess.Popen(
+        [sys.executable, "-m", "agent", *map(str, words), "--deadline", str(PATIENCE)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    ) as run:
+        sensor = None
+        try:
+            assert run.stderr is not None
+            told = next(line for line in run.stderr if "waits for its sensor" in line)
+            found = re.fullmatch(rf'node "{name}" waits for its sensor: run (\S+), address (\S+)\n', told)
+            assert found is not None
+            sensor = subprocess.Popen([sys.executable, SENSOR, found[1], name, found[2]])
+            run.stderr.read()
+            assert (run.wait(PATIENCE), sensor.wait(PATIENCE)) == (0, 0)
+        finally:
+            run.terminate()
+            if sensor is not None:
+                sensor.kill()
+                sensor.wait()
+    assert len([m for m in logged(recording) if m.topic == f"node/{name}/measurement"]) == 20

@@ -97,7 +97,7 @@ def test_a_recording_is_described(tmp_path: Path) -> None:
     facts = show.describe(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS))
     assert facts["kind"] == "recording"
     assert facts["messages"] == Counter(message.topic for message in sent)
-    assert (facts["run"], facts["seed"], facts["steps"], facts["status"]) == ("test", "1", "12", "finished")
+    assert (facts["run"], facts["seed"], facts["steps"], facts["status"]) == ("test", 1, 12, "finished")
     assert facts["damage"] == ""
     assert f"node/*/estimate: {4 * STEPS}" in show.text(facts)
     json.dumps(facts, allow_nan=False)

@@ -91,8 +91,13 @@ def _place(end: Facts) -> tuple[bool, int, int, str]:
 
 
 def _steps(end: Facts) -> int:
-    text = end.get("steps", "")
-    return int(text) if text.isascii() and text.isdigit() else -1
+    found = number(end.get("steps", ""))
+    return found if isinstance(found, int) else -1
+
+
+def number(text: str) -> int | str:
+    """A number that a recorder wrote down; the text itself where somebody else put something there."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else text
 
 
 def _ends(begun: list[Facts], ended: list[Facts]) -> list[Facts | None]:

@@ -27,6 +27,8 @@ def unfinished(path: Path) -> Path:
 
 def files_of(path: Path) -> list[Path]:
     """What there is of the recording `path`, in the order of its parts; an unfinished one has the name `unfinished`."""
+    if not path.name:  # . or /
+        return []
     name = re.compile(re.escape(path.stem) + r"\.part([2-9]|[1-9][0-9]+)" + re.escape(path.suffix) + r"(\.part)?")
     later = [(int(found[1]), there) for there in path.parent.glob("*") if (found := name.fullmatch(there.name))]
     first = [there for there in (path, unfinished(path)) if there.exists()]
@@ -41,7 +43,8 @@ def in_words(files: Sequence[Path | str]) -> str:
 
 def refuse_recording(path: Path, *, force: bool) -> None:
     """Raise InputError where the recording `path` may not be replaced, or could not be written."""
-    for there in (path, unfinished(path), *files_of(path)):
+    refuse_overwrite(path, force=force)  # first: what is a folder has no other parts
+    for there in (unfinished(path), *files_of(path)):
         refuse_overwrite(there, force=force)
     try:
         with tempfile.TemporaryFile(dir=path.parent):

@@ -46,6 +46,13 @@ REFUSED = [
     (TEXT.replace("[[topology]]", "[[topologies]]"), 'topologies: this key is not known here; "topology" is missing'),
     (edited("[plant]", "[plant]\nQ = 1"), "plant: Q: this key is not known here"),
     (edited("decay = 0.2", "decay = 0.2\nphase = 1"), "disturbance: phase: this key is not known here"),
+    # misspelt keys that are optional
+    ("unbiassed = true\n" + TEXT, 'unbiassed: this key is not known here; did you mean "unbiased"?'),
+    (edited("arrival_probability = 0.75", 'arrival_probability = 0.75\nlost = "seen"'),
+     'node "left": lost: this key is not known here; did you mean "loss"?'),
+    (TEXT + '\n[[links]]\nreceiver = "left"', 'links: this key is not known here; did you mean "link"?'),
+    (edited("decay = 0.2", "decay = 0.2\nfrequenzy = 1"),
+     'disturbance: frequenzy: this key is not known here; did you mean "frequency"?'),
     # topologies
     (edited(JOINED, JOINED + "\nhears = {}"),
      'topology "joined": hears and adjacency are both given; keep one of them'),
