@@ -18,6 +18,7 @@ from designer.model.error_model import error_model, stacked_gains
 from designer.model.units import NaturalUnits
 from designer.proof.certificate import lyapunov_matrix
 from designer.proof.prover import Prover
+from designer.search.baselines import BASELINES, design_baseline
 from designer.search.descent import Budget, Progress
 from designer.search.effort import BUDGET, default_method
 from designer.search.exact_design import certify, confirmed, design_exact, lower_end
@@ -25,6 +26,11 @@ from designer.search.exact_design import certify, confirmed, design_exact, lower
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 _PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
+
+
+def methods() -> list[str]:
+    """What `design` knows: the LMI's, the search, and what both are compared with."""
+    return [*METHODS, EXACT, *BASELINES]
 
 
 def design(
@@ -44,10 +50,12 @@ def design(
     as far as it is known.
     """
     method = default_method(problem) if method is None else method
-    if method not in METHODS and method != EXACT:
-        raise InputError(f'method "{method}" does not exist; the methods are {listed([*METHODS, EXACT])}')
+    if method not in methods():
+        raise InputError(f'method "{method}" does not exist; the methods are {listed(methods())}')
     refuse_nothing_to_estimate(problem)
     refuse_hopeless(problem)
+    if method in BASELINES:
+        return with_worst_case(design_baseline(problem, method))
     try:
         if method == EXACT:
             gains = _exact_in_natural_units(problem, Budget(budget), progress, dask)

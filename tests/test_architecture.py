@@ -58,6 +58,8 @@ ROOMS = {
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
     "designer.analysis": "designer.beyond_gamma designer.diagnosis designer.gain designer.ladder designer.model "
     "designer.proof designer.search",
+    "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
+    "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
     "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
@@ -74,9 +76,9 @@ ROOMS = {
     "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis "
     "designer.beyond_gamma designer.compare designer.diagnosis designer.export designer.gain designer.identify "
-    "designer.ladder designer.problems designer.proof designer.replay designer.report designer.reproduce "
-    "designer.search designer.show designer.simulation designer.sweep designer.synthesis designer.watch "
-    "designer.what_if",
+    "designer.ladder designer.problems designer.proof designer.ranking designer.replay designer.report "
+    "designer.reproduce designer.search designer.show designer.simulation designer.sweep designer.synthesis "
+    "designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }

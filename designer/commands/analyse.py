@@ -25,6 +25,13 @@ def add_analyse(commands: Subcommands) -> None:
     analyse.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write them as a gains file, their exact gain certified"
     )
+    analyse.add_argument(
+        "--against",
+        action="append",
+        default=[],
+        metavar="FILE|METHOD",
+        help="rank them with other gains in one table, by gamma; a file, or a method of design; may be repeated",
+    )
     analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
     analyse.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -45,5 +52,11 @@ def analyse_command(options: argparse.Namespace) -> int:
         gains.save(options.output, force=options.force)
         facts |= {"gamma": gains.certificate.gamma, "output": str(options.output)}
         text += f"\ngains      {options.output}, gamma = {rounded_up(gains.certificate.gamma)}, certified"
+    if options.against:
+        from designer.ranking import ranked, table
+
+        rows = ranked(problem, given, options.against)
+        facts["against"] = [row.document() for row in rows]
+        text += f"\n\n{table(rows)}"
     print(json.dumps(facts) if options.json else text)
     return EXIT_GOOD if analysis.stable else EXIT_NO

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
-    "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster "
+    "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster; "
+    "to compare with: least-variance: least mean square under white noise; consensus: Kalman-consensus filters; "
+    "diffusion: each its own Kalman filter, then the mean of all that it hears "
     "(default: exact; decomposed where more than 200 nodes hear too many others to be searched in windows)"
 )
 

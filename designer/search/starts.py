@@ -54,6 +54,27 @@ def consensus_gains(problem: Problem, *, weight: float = WEIGHT) -> StackedGains
     return K_bar, H_bar
 
 
+def diffusion_gains(problem: Problem) -> StackedGains:
+    """Kalman filters that diffuse: each node corrects by its own measurement, then takes the mean of what it hears.
+
+    Adapt and combine of Cattivelli and Sayed (IEEE Transactions on Automatic Control 55(9), 2010) without an exchange
+    of measurements, with constant gains and equal shares c_ij: K_ij = c_ij A / a_ij, H_ij = c_ij L_j / a_ij, where L_j
+    is the predictor gain of node j alone. The gains are unbiased.
+    """
+    nx, columns = problem.nx, measurement_slices(problem)
+    K_bar = np.zeros((len(problem.topologies), problem.n * nx, problem.n * nx))
+    H_bar = np.zeros((len(problem.topologies), problem.n * nx, rows_total(problem)))
+    spread = _plant_covariance(problem) if problem.carries_plant else np.zeros((nx, nx))
+    own = [_predictor_gain(problem, j, (j,), spread) for j in range(problem.n)]
+    for s in range(len(problem.topologies)):
+        for i in range(problem.n):
+            heard, rows = problem.neighbours(s, i), slice(i * nx, (i + 1) * nx)
+            for j in heard:
+                K_bar[s, rows, j * nx : (j + 1) * nx] = problem.plant.A / len(heard)
+                H_bar[s, rows, columns[j]] = own[j] / len(heard)
+    return K_bar, H_bar
+
+
 def _predictor_gain(problem: Problem, i: int, heard: tuple[int, ...], spread: Array) -> Array:
     """L = (A P C' + B D')(C P C' + D D' + losses)^-1 of the nodes `heard` by node i, (nx, their measurements).
 

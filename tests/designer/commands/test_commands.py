@@ -12,11 +12,10 @@ from places import ROOT
 
 from agent.contract.gains import Gains
 from designer.cli import main
-from designer.lmi.lmi_design import METHODS
 from designer.problems import names
 from designer.reproduce import EXAMPLES, Reproduced
 from designer.search import effort, windows
-from designer.synthesis import EXACT
+from designer.synthesis import methods
 
 
 def run(*arguments: object) -> int:
@@ -331,7 +330,7 @@ def test_wrong_words(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mon
     with pytest.raises(SystemExit):
         run("design", "--help")
     helped = capsys.readouterr().out
-    assert all(f"{method} " in helped or f"{method}:" in helped for method in (*METHODS, EXACT))
+    assert all(f"{method} " in helped or f"{method}:" in helped for method in methods())
     assert run("design", "two-nodes", "--method", "magic", "-o", "never.json") == 2
     assert 'method "magic" does not exist; the methods are "theorem2"' in capsys.readouterr().err
     assert not Path("never.json").exists()

@@ -1,0 +1,52 @@
+"""Gains that others would take, of the form (5) like all, to be compared with: nothing is searched, all is proved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from agent.contract.errors import Unattainable
+from agent.contract.gains import Gains, Solver
+from agent.contract.problem import Problem
+from designer.model.error_model import StackedGains, link_gains
+from designer.search.exact_design import certify
+from designer.search.starts import consensus_gains, diffusion_gains, least_variance_gains
+
+BASELINES: dict[str, Callable[[Problem], StackedGains]] = {
+    "least-variance": least_variance_gains,
+    "consensus": consensus_gains,
+    "diffusion": diffusion_gains,
+}
+
+
+def design_baseline(problem: Problem, method: str) -> Gains:
+    """The gains of one of BASELINES with a certificate; Unattainable where they let errors grow."""
+    started = time.perf_counter()
+    stacked = BASELINES[method](problem)
+    solved = time.perf_counter()
+    if not all(np.isfinite(gains).all() for gains in stacked):
+        raise Unattainable(f"{method} has no gains for {problem.name}: its Riccati equations have no finite solution")
+    K, H = link_gains(problem, *stacked)
+    try:
+        certificate = certify(problem, K, H)
+    except Unattainable as error:
+        raise Unattainable(f"{method} is no method for {problem.name}: {error}; --method exact searches") from None
+    ended = time.perf_counter()
+    return Gains(
+        problem=problem,
+        problem_digest=problem.digest(),
+        method=method,
+        K=K,
+        H=H,
+        certificate=certificate,
+        solver=Solver(
+            name="none, numpy",
+            version=np.__version__,
+            status=f"{method} gains, nothing was searched",
+            iterations=0,
+            seconds=solved - started,
+        ),
+        seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
+    )
