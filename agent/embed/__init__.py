@@ -14,9 +14,8 @@ from agent.contract.errors import InputError
 from agent.contract.files import refuse_overwrite, write_whole
 from agent.contract.gains import Gains
 from agent.embed import selftest, source
-from agent.embed.compiler import Built, build
 from agent.embed.names import names_of
-from agent.embed.vectors import answered, made, recorded
+from agent.embed.vectors import Vector, answered, made, recorded
 
 STEPS = 200  # that a self-test has, where nothing else is asked for
 
@@ -31,7 +30,7 @@ def export(
     steps: int = STEPS,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Write node.h, node.c and its self-test into `folder`, and build and run them where there is a compiler.
+    """Write a header, a source and a self-test of the node into `folder`.
 
     The self-test has the first `steps` of `recording`, or made ones of the agent's own filter. In `single` precision a
     recording gives what the node is told, and the agent's filter in float32 what it must answer. Returns the facts.
@@ -55,12 +54,12 @@ def export(
         "gains": gains.digest(),
         "real": source.REALS[dtype].name,
         "output": str(folder),
+        "name": names.node,
         "files": list(texts),
         "recording": str(recording) if recording else None,
         "steps": len(vectors),
         "begins": sum(vector.begins for vector in vectors),
         "off": _off(told, vectors) if recording and single else None,
-        "built": _facts(build(folder, names.node)),
     }
 
 
@@ -78,13 +77,10 @@ def _write(folder: Path, texts: dict[str, str], *, force: bool) -> None:
         write_whole(folder / name, text.encode(), force=force)
 
 
-def _off(told: list[Any], vectors: list[Any]) -> float:
+def _off(told: list[Vector], vectors: list[Vector]) -> float:
     """By how much, at most, an estimate is off the recorded one."""
     return max(
         float(np.abs(one.pair.x_hat - other.pair.x_hat.astype(float)).max())
         for one, other in zip(told, vectors, strict=True)
     )
 
-
-def _facts(built: Built | None) -> dict[str, Any] | None:
-    return None if built is None else built._asdict()

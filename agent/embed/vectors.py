@@ -134,7 +134,8 @@ def made(own: NodeGains, *, steps: int, dtype: np.dtype[Any]) -> list[Vector]:
 
 def answered(own: NodeGains, told: list[Vector], dtype: np.dtype[Any]) -> list[Vector]:
     """The same with what `agent.filter` answers, in numbers of this type."""
-    return list(_answers(_of_type(own, dtype), told, dtype))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond it is refused where it is written
+        return list(_answers(_of_type(own, dtype), told, dtype))
 
 
 def _answers(own: NodeGains, told: list[Vector], dtype: np.dtype[Any]) -> Iterator[Vector]:
@@ -160,12 +161,11 @@ def _answers(own: NodeGains, told: list[Vector], dtype: np.dtype[Any]) -> Iterat
 
 
 def _of_type(own: NodeGains, dtype: np.dtype[Any]) -> NodeGains:
-    with np.errstate(over="ignore"):  # what is beyond it is refused where it is written
-        rows = {mode: rows.astype(dtype) for mode, rows in own.rows.items()}
-        return own._replace(
-            C=own.C.astype(dtype), M=own.M.astype(dtype), rows=rows, A=None if own.A is None else own.A.astype(dtype),
-            arrival_probability=dtype.type(own.arrival_probability),
-        )  # fmt: skip
+    rows = {mode: rows.astype(dtype) for mode, rows in own.rows.items()}
+    return own._replace(
+        C=own.C.astype(dtype), M=own.M.astype(dtype), rows=rows, A=None if own.A is None else own.A.astype(dtype),
+        arrival_probability=dtype.type(own.arrival_probability),
+    )  # fmt: skip
 
 
 def _filled(own: NodeGains, mode: str, heard: dict[str, Pair], dtype: np.dtype[Any]) -> dict[str, Pair]:

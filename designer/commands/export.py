@@ -73,6 +73,7 @@ def export_command(options: argparse.Namespace) -> int:
 def _export_c(options: argparse.Namespace) -> int:
     """A node as C; exit code 1 where a compiler of this machine makes a node of it that computes otherwise."""
     from agent.embed import STEPS, export
+    from agent.embed.compiler import build
     from agent.embed.names import names_of
 
     if len(options.recordings) > 1:
@@ -82,17 +83,20 @@ def _export_c(options: argparse.Namespace) -> int:
     gains = load_gains(options.recordings[0])
     if options.node is None:
         raise InputError(f"--c is of one node; name it with --node: {listed(gains.problem.node_names)}")
+    folder = options.output or Path(names_of(gains.problem, options.node).node)
     facts = export(
         gains,
         options.node,
-        options.output or Path(names_of(gains.problem, options.node).node),
+        folder,
         single=options.single,
         recording=options.vectors,
         steps=options.steps or STEPS,
         force=options.force,
     )
+    built = build(folder, facts["name"])
+    facts["built"] = None if built is None else built._asdict()
     print(json.dumps(facts) if options.json else _text_of_c(facts))
-    return EXIT_GOOD if facts["built"] is None or facts["built"]["passes"] else EXIT_NO
+    return EXIT_GOOD if built is None or built.passes else EXIT_NO
 
 
 def _text_of_c(facts: dict[str, Any]) -> str:
