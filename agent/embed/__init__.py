@@ -83,4 +83,3 @@ def _off(told: list[Vector], vectors: list[Vector]) -> float:
         float(np.abs(one.pair.x_hat - other.pair.x_hat.astype(float)).max())
         for one, other in zip(told, vectors, strict=True)
     )
-
