@@ -30,6 +30,13 @@ def build(folder: Path, node: str) -> Built | None:
     compiler = next((found for name in COMPILERS if (found := shutil.which(name))), None)
     if compiler is None:
         return None
+    try:
+        return _built(compiler, folder, node)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Built(compiler, False, str(error))
+
+
+def _built(compiler: str, folder: Path, node: str) -> Built:
     body, test = folder.resolve() / f"{node}.c", folder.resolve() / f"{node}_selftest.c"
     with tempfile.TemporaryDirectory() as work:
         made = _said(work, compiler, *FLAGS, "-O2", "-o", "selftest", str(test), str(body))

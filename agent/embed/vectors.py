@@ -44,7 +44,9 @@ def recorded(gains: Gains, node: str, recording: Path, *, steps: int) -> list[Ve
     told, measured = _messages(gains, own, recording, steps=steps)
     said = [k for k in sorted(told[node]) if not told[node][k].measured or k in measured]
     if not said:
-        raise InputError(f'{recording} has no step of node "{node}" with its measurement; a self-test needs one')
+        raise InputError(
+            f'{recording} has no step of node "{node}" and its measurement below {steps}; a self-test needs one'
+        )
     goes_on = {k for k, after in pairwise(said) if after == k + 1 and _can_go_on(told, node, after)}
     vectors = []
     for k in said:
