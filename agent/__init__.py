@@ -3,7 +3,7 @@
 the rooms       contract: what both packages share, files, keys and messages; network: a participant's place on it;
                 roles: node, plant, coordinator, recorder; commands: what the program does
 a node's step   inbox: what must be there before it; filter: eqs. (4) and (5); product: its sums;
-                estimates: what is told of it
+                estimates: what is told of it; embed: the same in C, for a device
 the clock       pacing: a run against it, as data; faults: what such a run is to survive
 a whole run     plan: what the coordinator decides; receipts: what the recorder has; launch: every role on this machine
                 nursery: the process that they are forked from; children: how it is spoken to

@@ -28,6 +28,7 @@ ROOMS = {
     "agent.guard": "agent.plan",
     "agent.refusals": "agent.guard",
     "agent.estimates": "agent.filter agent.product",
+    "agent.embed": "agent.contract.recording agent.filter agent.product",
     "agent.pacing": "agent.estimates agent.filter agent.inbox agent.plan",
     "agent.receipts": "",
     "agent.signals": "",
@@ -74,7 +75,7 @@ ROOMS = {
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording designer.problems",
-    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis "
+    "designer.commands": "agent.commands agent.contract.recording agent.embed agent.signals designer.analysis "
     "designer.beyond_gamma designer.compare designer.diagnosis designer.export designer.gain designer.identify "
     "designer.ladder designer.problems designer.proof designer.ranking designer.replay designer.report "
     "designer.reproduce designer.search designer.show designer.simulation designer.sweep designer.synthesis "

@@ -1,4 +1,4 @@
-"""`peakmesh export`: a recording as a table for other programs."""
+"""`peakmesh export`: a recording as a table for other programs, and a node's gains as C for a device."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from agent.commands.options import Subcommands, add_command
-from agent.contract.errors import EXIT_GOOD, InputError, counted
+from agent.commands.options import Subcommands, add_command, count, load_gains
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted, listed
 from agent.contract.files import refuse_overwrite
 from designer.commands.recordings import Progress, add_choice
 
@@ -17,10 +17,17 @@ from designer.commands.recordings import Progress, add_choice
 def add_export(commands: Subcommands) -> None:
     """Describe `export` to the parser."""
     export = add_command(
-        commands, "export", export_command, "a recording as a table: CSV, Parquet (peakmesh[parquet]) or MATLAB"
+        commands,
+        "export",
+        export_command,
+        "a recording as a table: CSV, Parquet (peakmesh[parquet]) or MATLAB; a node of a gains file as C",
     )
     export.add_argument(
-        "recordings", type=Path, nargs="+", metavar="RECORDING", help="recording, or the parts of one; cut ones too"
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="recording, or the parts of one; cut ones too; with --c a gains file",
     )
     add_choice(export)
     to = export.add_mutually_exclusive_group(required=True)
@@ -31,14 +38,90 @@ def add_export(commands: Subcommands) -> None:
     to.add_argument(
         "--mat", action="store_const", dest="to", const="mat", help="arrays for MATLAB, a row for each step"
     )
+    to.add_argument(
+        "--c", action="store_const", dest="to", const="c", help="a node's filter as C99 for a device, with a self-test"
+    )
     export.add_argument("--wide", action="store_true", help="one row for each step, one column for each number")
-    export.add_argument("-o", "--output", type=Path, metavar="FILE", help="where to (beside the recording)")
+    _add_c(export)
+    export.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="where to (beside the recording); a folder with --c (node_N)"
+    )
     export.add_argument("--force", action="store_true", help="replace what exists")
     export.add_argument("--json", action="store_true", help="print one JSON object")
 
 
+def _add_c(export: argparse.ArgumentParser) -> None:
+    """Add what goes with --c alone."""
+    export.add_argument("--node", metavar="NAME", help="with --c: which node")
+    export.add_argument("--float", dest="single", action="store_true", help="with --c: in float, not in double")
+    export.add_argument(
+        "--vectors", type=Path, metavar="RECORDING", help="with --c: what the self-test tells the node (made up)"
+    )
+    export.add_argument("--steps", type=count, metavar="N", help="with --c: steps of the self-test (200)")
+
+
 def export_command(options: argparse.Namespace) -> int:
-    """`peakmesh export RECORDING`: what is not whole is exported as far as it goes, and stderr says so."""
+    """`peakmesh export FILE`."""
+    only_c = {"--node": options.node, "--float": options.single, "--vectors": options.vectors, "--steps": options.steps}
+    if options.to == "c":
+        return _export_c(options)
+    for name in (name for name, value in only_c.items() if value):
+        raise InputError(f"{name} is for --c; a recording is exported whole")
+    return _export_table(options)
+
+
+def _export_c(options: argparse.Namespace) -> int:
+    """A node as C; exit code 1 where a compiler of this machine makes a node of it that computes otherwise."""
+    from agent.embed import STEPS, export
+    from agent.embed.compiler import build
+    from agent.embed.names import names_of
+
+    if len(options.recordings) > 1:
+        raise InputError(f"--c takes one gains file, not {len(options.recordings)}; --vectors names a recording")
+    for name in (name for name in ("wide", "run", "gains") if getattr(options, name)):
+        raise InputError(f"--{name} says something of a recording; --c takes a gains file")
+    gains = load_gains(options.recordings[0])
+    if options.node is None:
+        raise InputError(f"--c is of one node; name it with --node: {listed(gains.problem.node_names)}")
+    folder = options.output or Path(names_of(gains.problem, options.node).node)
+    facts = export(
+        gains,
+        options.node,
+        folder,
+        single=options.single,
+        recording=options.vectors,
+        steps=options.steps or STEPS,
+        force=options.force,
+    )
+    built = build(folder, facts["name"])
+    facts["built"] = None if built is None else built._asdict()
+    print(json.dumps(facts) if options.json else _text_of_c(facts))
+    return EXIT_GOOD if built is None or built.passes else EXIT_NO
+
+
+def _text_of_c(facts: dict[str, Any]) -> str:
+    vectors = f"{facts['steps']} steps of {facts['recording'] or 'chance, as the agent answers them'}"
+    begins = f", begun again {counted(facts['begins'], 'time')}" if facts["begins"] else ""
+    lines = [f"node {facts['node']} of {facts['problem']} as C, in {facts['real']}: {facts['output']}"]
+    lines += [f"files      {', '.join(facts['files'])}", f"vectors    {vectors}{begins}"]
+    if facts["off"] is not None:
+        lines.append(f"float      an estimate is off the recorded one by {facts['off']:.2g} at most")
+    built = facts["built"]
+    if built is None:
+        return "\n".join(
+            [*lines, "self-test  not run, and sizes not known: there is no C compiler here (cc, gcc, clang)"]
+        )
+    lines.append(f"self-test  {'passes' if built['passes'] else 'FAILS'} with {built['compiler']}: {built['says']}")
+    if built["text"] is not None:
+        stack = "" if built["stack"] is None else f"; stack {built['stack']} bytes at most"
+        lines.append(
+            f"size       text {built['text']}, data {built['data']}, bss {built['bss']} bytes{stack}; -Os, here"
+        )
+    return "\n".join(lines)
+
+
+def _export_table(options: argparse.Namespace) -> int:
+    """What is not whole is exported as far as it goes, and stderr says so."""
     from designer.export import export
     from designer.replay.log import load
 
