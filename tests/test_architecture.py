@@ -55,7 +55,8 @@ ROOMS = {
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
-    "designer.analysis": "designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
+    "designer.box": "designer.decay designer.gain designer.model designer.proof",
+    "designer.analysis": "designer.box designer.diagnosis designer.gain designer.ladder designer.model designer.proof "
     "designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
@@ -71,9 +72,9 @@ ROOMS = {
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording designer.problems",
-    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis designer.compare "
-    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
-    "designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
+    "designer.commands": "agent.commands agent.contract.recording agent.signals designer.analysis designer.box "
+    "designer.compare designer.diagnosis designer.export designer.gain designer.identify designer.ladder "
+    "designer.problems designer.proof designer.replay designer.report designer.reproduce designer.search designer.show "
     "designer.simulation designer.sweep designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
