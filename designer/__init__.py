@@ -1,10 +1,10 @@
 """The mathematics of peakmesh, seen centrally: design, verification, replay, report.
 
 the rooms       model: eqs. (6)-(11); gain: what gains really guarantee; lmi: Theorem 2, and gains by it;
-                search: gains of least exact gain; proof: certificates, without a solver; ledger: the bound through
-                faults; replay: one recording, judged; identify: recordings against probabilities; report: how it looks;
-                export: tables of it; watch: a run that goes on, as it is seen; problems: the paper's examples, and
-                others; commands: what the program does
+                search: gains of least exact gain; proof: certificates, without a solver; box: every model
+                in a box; ledger: the bound through faults; replay: one recording, judged; identify: recordings against
+                probabilities; report: how it looks; export: tables of it; watch: a run that goes on, as it is seen;
+                problems: the paper's examples, and others; commands: what the program does
 the design      decay: whether errors die out; synthesis: one method or another; diagnosis: why there is no solution;
                 ladder: what a design is worth; beyond_gamma: noise, and each node by itself
 other answers   analysis: somebody else's gains; ranking: gains beside others; what_if: without a node or a link;

@@ -20,6 +20,8 @@ from agent.contract.files import read_bytes, read_json
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
 from designer.beyond_gamma import BeyondGamma, beyond_gamma, told
+from designer.box.extent import Box
+from designer.box.robust import Robust, robust
 from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
@@ -63,6 +65,7 @@ class Analysis(NamedTuple):
     w: Array | None  # (at most fixed_within, nw), of energy 1
     unproved: str | None = None  # why no gamma is certified, where the gain is finite
     beyond: BeyondGamma | None = None  # noise, and each node by itself
+    robust: Robust | None = None  # what is proved for every model of a box, if one was given
 
     @property
     def foreign(self) -> bool:
@@ -95,6 +98,7 @@ class Analysis(NamedTuple):
                 "w": self.w.tolist(),
             },
             **({"white_noise": None, "node_gains": None} if self.beyond is None else self.beyond.document()),
+            "within": None if self.robust is None else self.robust.document(),
         }
 
     def text(self) -> str:
@@ -132,6 +136,7 @@ class Analysis(NamedTuple):
             f"multiplies E|error|^2 by {self.radius:.6g} in the long run",
             f"exact gain between {interval(low, high)}, {how}: {_steps(self.horizon)} show that it is no less",
             f"ladder     {rungs}",
+            *([] if self.robust is None else self.robust.lines()),
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
             f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
             f"           that is fixed beforehand: gain {self.fixed:.6g} "
@@ -171,8 +176,8 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     return GivenGains(K, H, str(path), file)
 
 
-def analyse(problem: Problem, given: GivenGains) -> Analysis:
-    """The exact gain of the gains on the problem, and what attains it."""
+def analyse(problem: Problem, given: GivenGains, box: Box | None = None) -> Analysis:
+    """The exact gain of the gains on the problem, what attains it, and what holds for every model of a box."""
     refuse_nothing_to_estimate(problem)
     model = error_model(problem, *stacked_links(problem, given.K, given.H))
     gain = exact_gain(model)
@@ -185,6 +190,10 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
     verdict = confirmed(problem, given.K, given.H, gain.high)
     if verdict.holds:
         ladder = ladder._replace(exact=(lower_end(problem, given.K, given.H, gain), verdict.gamma))
+    in_box = None if box is None else robust(problem, given.K, given.H, box)
+    if in_box is not None:
+        found = in_box.found if math.isfinite(in_box.found) else None
+        ladder = ladder._replace(found_in_box=found, proved_in_box=in_box.gamma)
     policy = worst_policy(model, horizon=gain.horizon)
     fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
@@ -202,6 +211,7 @@ def analyse(problem: Problem, given: GivenGains) -> Analysis:
         w=fixed.w,
         unproved=verdict.failure,
         beyond=beyond_gamma(problem, given.K, given.H),
+        robust=in_box,
     )
 
 

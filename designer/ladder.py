@@ -14,6 +14,7 @@ from agent.contract.gains import Gains
 from designer.lmi import beyond_paper
 
 FLOOR, EXACT, CERTIFIED = "floor", "exact gain of these gains", "gamma, certified"
+FOUND_IN_BOX, PROVED_IN_BOX = "exact gain of the worst model found in the box", "proved for every model in the box"
 _NOTHING = 1e-6  # a floor this small beside the gain says nothing
 
 
@@ -27,6 +28,8 @@ class Ladder(NamedTuple):
     theorem2: float | None  # its bound, as the solver gave it
     lmi: str = "Theorem 2"  # what the LMI is called: beyond the paper's model it is not Theorem 2's
     theorem1: float | None = None  # certified for these gains too, where gamma is less
+    found_in_box: float | None = None  # what these gains have in the worst model of a box that was found
+    proved_in_box: float | None = None  # gamma for every model of it
 
     @property
     def against_theorem2(self) -> float | None:
@@ -54,6 +57,8 @@ class Ladder(NamedTuple):
             (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
             (f"{self.lmi}'s bound", self.theorem2),
             ("what Theorem 1 certifies of these gains", self.theorem1),
+            (FOUND_IN_BOX, self.found_in_box),
+            (PROVED_IN_BOX, self.proved_in_box),
         ]
         return [(name, value) for name, value in rungs if value is not None]
 

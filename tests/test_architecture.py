@@ -57,8 +57,9 @@ ROOMS = {
     "designer.ladder": "designer.lmi",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
-    "designer.analysis": "designer.beyond_gamma designer.diagnosis designer.gain designer.ladder designer.model "
-    "designer.proof designer.search",
+    "designer.box": "designer.decay designer.gain designer.model designer.proof",
+    "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
+    "designer.model designer.proof designer.search",
     "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
@@ -76,10 +77,10 @@ ROOMS = {
     "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.contract.recording agent.embed agent.signals designer.analysis "
-    "designer.beyond_gamma designer.compare designer.diagnosis designer.export designer.gain designer.identify "
-    "designer.ladder designer.problems designer.proof designer.ranking designer.replay designer.report "
-    "designer.reproduce designer.search designer.show designer.simulation designer.sweep designer.synthesis "
-    "designer.watch designer.what_if",
+    "designer.beyond_gamma designer.box designer.compare designer.diagnosis designer.export designer.gain "
+    "designer.identify designer.ladder designer.problems designer.proof designer.ranking designer.replay "
+    "designer.report designer.reproduce designer.search designer.show designer.simulation designer.sweep "
+    "designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }

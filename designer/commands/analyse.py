@@ -10,6 +10,7 @@ from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM, add_set, find_to_design, tell_notes
+from designer.commands.within import add_within
 
 
 def add_analyse(commands: Subcommands) -> None:
@@ -32,6 +33,7 @@ def add_analyse(commands: Subcommands) -> None:
         metavar="FILE|METHOD",
         help="rank them with other gains in one table, by gamma; a file, or a method of design; may be repeated",
     )
+    add_within(analyse)
     analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
     analyse.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -39,13 +41,15 @@ def add_analyse(commands: Subcommands) -> None:
 def analyse_command(options: argparse.Namespace) -> int:
     """`peakmesh analyse PROBLEM --gains FILE`: exit code 1 where the errors are not mean-square stable."""
     from designer.analysis import analyse, certified, load_given
+    from designer.box.extent import box_of, within
     from designer.ladder import rounded_up
 
     problem = find_to_design(options.problem, options.settings)
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
+    box = box_of(problem, within(options.within)) if options.within else None
     given = load_given(options.gains, problem)
-    analysis = analyse(problem, given)
+    analysis = analyse(problem, given, box)
     facts, text = analysis.document() | {"notes": tell_notes(problem), "output": None}, analysis.text()
     if options.output is not None and analysis.stable:
         gains = certified(problem, given)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from agent.commands.options import Subcommands, add_command, load_gains
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted, listed
 from designer.commands import add_set
+from designer.commands.within import add_within
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -34,11 +35,14 @@ def add_verify(commands: Subcommands) -> None:
     verify.add_argument(
         "--balls", action="store_true", help="in ball arithmetic alone: slower, and nothing is assumed of numpy"
     )
+    add_within(verify)
     verify.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS [PROBLEM]`."""
+    from designer.box.extent import box_of, within
+    from designer.box.robust import robust
     from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
@@ -46,6 +50,7 @@ def verify_command(options: argparse.Namespace) -> int:
     if options.settings and options.problem is None:
         raise InputError(f"--set {options.settings[0]} is for PROBLEM; name the problem that the gains have to be for")
     gains = load_gains(options.gains)
+    box = box_of(gains.problem, within(options.within)) if options.within else None
     differs = [] if options.problem is None else _differences(gains.problem, find(options.problem, options.settings))
     if set(differs) - _BESIDE:
         return _for_another(gains, options, differs)
@@ -54,26 +59,30 @@ def verify_command(options: argparse.Namespace) -> int:
         verdict = verify(gains, makes=BALLS if options.balls else FLOATS + BALLS)
     except InputError as error:
         raise InputError(f"{options.gains}: {error}") from None
+    in_box = None if box is None or not verdict.holds else robust(gains.problem, gains.K, gains.H, box)
+    good = EXIT_GOOD if verdict.holds and (in_box is None or in_box.gamma is not None) else EXIT_NO
     seconds, claim = time.perf_counter() - started, gains.certificate
     proved, how = [PROVED[claim.kind]], f"{verdict.arithmetic}; {seconds:.2f} s"
     if claim.theorem1_gamma is not None:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
     if options.json:
-        said = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
+        said: dict[str, object] = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
+        said["within"] = None if in_box is None else in_box.document()
         of = _of_problem(gains, options.gains)
         print(json.dumps(verdict._asdict() | said | of | {"claimed": _claimed(gains, verdict.low)}))
-        return EXIT_GOOD if verdict.holds else EXIT_NO
+        return good
     lines = [f"of      {text}" for text in _whose(gains, differs)]
     if verdict.holds:
         if verdict.low is not None:
             proved.append(f"the exact gain is between {verdict.low} and {verdict.gamma}: below, some w does worse")
         lines = [f"holds: gamma = {verdict.gamma} is proved", *lines, *(f"proved  {text}" for text in proved)]
+        lines += [] if in_box is None else in_box.of_verify()
         lines += [f"claimed {text}" for text in _claimed(gains, verdict.low)]
     else:
         no = f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
         lines = [no, *lines]
     print("\n".join([*lines, f"in      {how}"]))
-    return EXIT_GOOD if verdict.holds else EXIT_NO
+    return good
 
 
 def _differences(found: Problem, wanted: Problem) -> list[str]:

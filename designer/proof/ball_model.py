@@ -12,15 +12,31 @@ the products of both.
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
 from flint import arb, arb_mat
 from numpy.typing import NDArray
 
+from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.proof.balls import add, exact, identity, part
+
+
+class Truth(NamedTuple):
+    """What happens, where that is not what the filters were told: the gains and the beta_j in them stay as they are."""
+
+    beta: Array  # (n,): of arrivals
+    rho: Array  # (n, n): of deliveries, from j to i
+    transition: list[list[Fraction]]  # Pi; every row sums to 1
+
+
+def told(problem: Problem) -> Truth:
+    """The probabilities of the file; rows of Pi renormalised, for they sum to 1 within the problem's tolerance only."""
+    rows = [[Fraction(pi) for pi in row] for row in problem.markov.transition.tolist()]
+    return Truth(problem.beta, problem.delivery, [[pi / sum(row) for pi in row] for row in rows])
 
 
 class Noise(NamedTuple):
@@ -34,9 +50,13 @@ class Noise(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """What node j measures: its mean innovation is C_mean e_j + D_mean w; a loss takes `lost` [eta; w] from it."""
+    """What node j measures: its mean innovation bias x + C_mean e_j + D_mean w; a loss takes `lost` [eta; w] from it.
 
-    C_mean: arb_mat  # beta_j C_j
+    A node that does not see its losses subtracts c_j C_j x_hat_j, where c_j is the beta_j that it was told.
+    """
+
+    bias: arb_mat | None  # (beta_j - c_j) C_j; None where that is 0
+    C_mean: arb_mat  # c_j C_j, or beta_j C_j where the loss is seen
     D_mean: arb_mat  # D_j, or beta_j D_j where the loss is seen
     alpha: arb  # beta_j (1 - beta_j)
     columns: list[int]  # of `lost`
@@ -46,8 +66,9 @@ class Sensor(NamedTuple):
 class BallModel:
     """[A B] and the noise of every mode, M, and the chain; eta = [x; e_1; ...; e_n], or e alone where x drops out."""
 
-    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
+    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
         nx, n = problem.nx, problem.n
+        self.truth = truth or told(problem)
         p = problem.plant_states
         self.size, self.nw = p + n * nx, problem.nw
         self.x = list(range(p))
@@ -57,10 +78,7 @@ class BallModel:
         self.M = arb_mat(n * problem.nz, self.size)
         for i in range(n):
             add(self.M, range(i * problem.nz, (i + 1) * problem.nz), self.e[i], exact(problem.plant.M))
-        self.transition = []  # rows renormalised: they sum to 1 within the problem's tolerance only
-        for row in problem.markov.transition.tolist():
-            total = sum((arb(pi) for pi in row), arb(0))
-            self.transition.append([arb(pi) / total for pi in row])
+        self.transition = [[arb(pi.numerator) / arb(pi.denominator) for pi in row] for row in self.truth.transition]
         self.sensors = [self._sensor(problem, j) for j in range(n)]
         self.AB: list[arb_mat] = []  # (n_eta, n_eta + nw), of every mode
         self.filled: list[NDArray[np.bool_]] = []  # where AB may be other than exactly 0
@@ -76,14 +94,17 @@ class BallModel:
 
     def _sensor(self, problem: Problem, j: int) -> Sensor:
         node = problem.nodes[j]
-        C, D, beta = exact(node.C), exact(node.D), arb(node.arrival_probability)
+        C, D, beta, c = exact(node.C), exact(node.D), arb(self.truth.beta[j].item()), arb(node.arrival_probability)
+        if beta != c and not node.seen and not self.x:
+            raise ValueError(f'node "{node.name}" loses what it does not see: its errors contain x, which is left out')
         columns, lost = self.x, C
         if node.seen:
             ny = C.nrows()
             columns, lost = self.e[j] + self.w, arb_mat(ny, problem.nx + problem.nw)
             add(lost, range(ny), range(problem.nx), C)
             add(lost, range(ny), range(problem.nx, problem.nx + problem.nw), D)
-        return Sensor(C * beta, D * beta if node.seen else D, beta * (1 - beta), columns, lost)
+        bias, by_D = (None, D * beta) if node.seen else (C * (beta - c) if beta != c else None, D)
+        return Sensor(bias, C * (beta if node.seen else c), by_D, beta * (1 - beta), columns, lost)
 
     def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> list[Noise]:
         """Fill in [A B] of mode s; its noise. K and H have the weights a_ij within from here on."""
@@ -105,8 +126,11 @@ class BallModel:
                 self._add(s, self.e[i], self.x, A - others - K_i[i])
             self._add(s, self.e[i], self.w, B)
             for j in weights:
-                sensor, rho = self.sensors[j], arb(problem.delivery[i, j].item())
+                sensor, rho = self.sensors[j], arb(self.truth.rho[i, j].item())
+                by_x = None if sensor.bias is None else -(H_i[j] * sensor.bias)
                 by_e, by_w = K_i[j] - H_i[j] * sensor.C_mean, -(H_i[j] * sensor.D_mean)
+                if by_x is not None:
+                    self._add(s, self.e[i], self.x, by_x * rho)
                 self._add(s, self.e[i], self.e[j], by_e * rho)
                 self._add(s, self.e[i], self.w, by_w * rho)
                 carried[j].append((self.e[i], H_i[j] * -rho))
@@ -114,19 +138,21 @@ class BallModel:
                     continue
                 self._add(s, self.e[i], self.e[i], K_i[j] * (1 - rho))
                 lossy = rho * (1 - rho)
-                noise.append(self._of_link(i, j, lossy, K_i[j], by_e, by_w))
+                parts = [(self.e[i], -K_i[j]), (self.e[j], by_e), (self.w, by_w), (self.x, by_x)]
+                noise.append(self._of_link(i, lossy, parts))
                 if sensor.alpha > 0:
                     noise.append(Noise(lossy * sensor.alpha, self.e[i], -H_i[j], sensor.columns, sensor.lost))
         noise += [self._of_sensor(j, carried[j]) for j in range(problem.n) if self.sensors[j].alpha > 0]
         return noise
 
-    def _of_link(self, i: int, j: int, variance: arb, K_ij: arb_mat, by_e: arb_mat, by_w: arb_mat) -> Noise:
+    def _of_link(self, i: int, variance: arb, parts: list[tuple[list[int], arb_mat | None]]) -> Noise:
         """A message that arrives: K_ij (e_j - e_i) less H_ij times node j's mean innovation, in e_i."""
-        nx, nw = K_ij.nrows(), self.nw
-        C = arb_mat(nx, 2 * nx + nw)
-        for first, block in ((0, -K_ij), (nx, by_e), (2 * nx, by_w)):
+        nx, columns = len(self.e[i]), [at for at, block in parts if block is not None]
+        C, first = arb_mat(nx, sum(map(len, columns))), 0
+        for block in (block for _, block in parts if block is not None):
             add(C, range(nx), range(first, first + block.ncols()), block)
-        return Noise(variance, self.e[i], identity(nx), self.e[i] + self.e[j] + self.w, C)
+            first += block.ncols()
+        return Noise(variance, self.e[i], identity(nx), [k for at in columns for k in at], C)
 
     def _of_sensor(self, j: int, carried: list[tuple[list[int], arb_mat]]) -> Noise:
         """A measurement that arrives: what a loss takes, in the errors of all who hear node j."""

@@ -10,7 +10,7 @@ from flint import ctx
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.proof.ball_model import BallModel
+from designer.proof.ball_model import BallModel, Truth
 from designer.proof.balls import UNDECIDED, Sign
 from designer.proof.float64 import Bounded, bounded_below, difference, quotient, raised, sign, symmetric
 from designer.proof.float_model import FloatModel
@@ -25,9 +25,9 @@ class ByFloats:
     name = f"float64 with a bound on every rounding (numpy {np.__version__})"
     cost = 1.0
 
-    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> None:
+    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
         with ctx.workprec(_BITS):
-            self.model = FloatModel(BallModel(problem, K, H))
+            self.model = FloatModel(BallModel(problem, K, H, truth))
         self.order = self.model.size
         wrong = fault(self.model.order)
         if wrong is not None:

@@ -1,0 +1,1 @@
+"""Gamma for every model in a box: probabilities are estimated, and the gains have to hold for what they really are."""
