@@ -60,6 +60,7 @@ def export(
         "steps": len(vectors),
         "begins": sum(vector.begins for vector in vectors),
         "off": _off(told, vectors) if recording and single else None,
+        "largest": max(float(np.abs(vector.pair.x_hat).max()) for vector in vectors),
     }
 
 

@@ -76,7 +76,9 @@ def number(value: float, dtype: np.dtype[Any]) -> str:
     with np.errstate(over="ignore"):
         rounded = float(dtype.type(value))
     if not np.isfinite(rounded):
-        raise InputError(f"{value:g} is beyond {REALS[dtype].name}; leave --float out")
+        raise InputError(
+            f"{value:g} is beyond {REALS[dtype].name}{'; leave --float out' if np.isfinite(value) else ''}"
+        )
     return rounded.hex() + REALS[dtype].suffix
 
 

@@ -105,7 +105,8 @@ def _text_of_c(facts: dict[str, Any]) -> str:
     lines = [f"node {facts['node']} of {facts['problem']} as C, in {facts['real']}: {facts['output']}"]
     lines += [f"files      {', '.join(facts['files'])}", f"vectors    {vectors}{begins}"]
     if facts["off"] is not None:
-        lines.append(f"float      an estimate is off the recorded one by {facts['off']:.2g} at most")
+        off = f"{facts['off']:.2g} at most, of estimates up to {facts['largest']:.2g}"
+        lines.append(f"float      an estimate is off the recorded one by {off}")
     built = facts["built"]
     if built is None:
         return "\n".join(

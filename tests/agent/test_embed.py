@@ -134,7 +134,10 @@ def test_the_agents_own_filter_comes_back(kind: str, single: bool, tmp_path: Pat
 def test_float_says_how_far_it_is_from_the_recording(tmp_path: Path) -> None:
     gains, recording = Gains.load(LOSSY), GOLDEN / "zhu2020-lossy.mcap"
     facts = export(gains, "2", tmp_path, single=True, recording=recording)
-    assert 1e-12 < facts["off"] < 1e-5
+    told = [json.loads(message.payload) for message in logged(recording) if message.topic == "node/2/estimate"]
+    largest = max(abs(x) for message in told for x in message["x_hat"])
+    assert facts["largest"] == pytest.approx(largest, rel=1e-5)
+    assert 1e-10 * largest < facts["off"] < 1e-5 * largest
     assert checked(tmp_path).returncode == 0
 
 
