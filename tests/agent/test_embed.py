@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from here import here
 from made_recordings import Sent, observer_gains, random_gains, random_problem, real_problem, record
-from places import GOLDEN
+from places import GOLDEN, ROOT
 from runs import logged
 from simulated.network import Weather
 from simulated.night import simulated
@@ -218,6 +218,23 @@ def test_a_fused_build_is_caught(unbiased: Path) -> None:
     assert re.match(r'node "n1": step \d+: \w+\[\d\] is -?0x1\.\w+p\S+, must be -?0x1\.\w+p\S+ \(', done.stdout)
 
 
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["-ffast-math"], "-ffast-math reorders sums"),
+        (["-mfpmath=387"], "computes in wider numbers than double"),
+        (["-include", "short.h"], "double is not an IEEE 754 number of 64 bits here"),
+    ],
+)
+def test_what_would_compute_otherwise_does_not_compile(flags: list[str], says: str, unbiased: Path) -> None:
+    compiler = tool("gcc")
+    if "-mfpmath=387" in flags and platform.machine() != "x86_64":
+        pytest.skip("x87 is of x86-64")
+    (unbiased / "short.h").write_text("#include <float.h>\n#undef DBL_MANT_DIG\n#define DBL_MANT_DIG 24\n")
+    done = said(compiler, *STRICT, *flags, "-fsyntax-only", "node_n1.c", cwd=unbiased)
+    assert (done.returncode, says in done.stderr) == (1, True)
+
+
 MUTANTS = {
     "uses what was not heard": ("pair->heard ? pair->x_hat : own", "pair->x_hat"),
     "uses an innovation that was not heard": ("(pair->heard ? pair->innovation[c] : 0x0.0p+0)", "pair->innovation[c]"),
@@ -384,6 +401,15 @@ def test_two_nodes_fit_into_one_program(tmp_path: Path) -> None:
     files = ["both.c", *(f"{name}.c" for name in names)]
     made = said(compiler, *STRICT, "-o", "both", *files, cwd=tmp_path)
     assert (made.returncode, made.stderr) == (0, "")
+
+
+def test_what_the_document_names_is_in_the_header(tmp_path: Path) -> None:
+    """Functions, types and constants of node 2."""
+    export(Gains.load(LOSSY), "2", tmp_path)
+    there = set(re.findall(r"\w+", (tmp_path / "node_2.h").read_text()))
+    named = set(re.findall(r"\b(?:node_2_|NODE_2_)\w+", (ROOT / "docs" / "embedded.md").read_text()))
+    assert {"node_2_step", "NODE_2_GAINS"} < named
+    assert named - there - {"node_2_selftest"} == set()
 
 
 # the command
