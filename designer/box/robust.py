@@ -101,11 +101,11 @@ def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robu
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))  # the worst first
     models = [ByFloats(problem, K, H, corner) for corner in every]
     nominal = error_model_of(problem, problem.beta, *stacked_links(problem, K, H))
-    P = _invariant(ByVertices(models, np.zeros(0)), Operator(nominal).units)
+    P = invariant(ByVertices(models, np.zeros(0)), Operator(nominal).units)
     least: tuple[float, ByVertices] | None = None
     for model in (_model(problem, K, H, truth), nominal) if P is not None else ():
         for above in _ABOVE:
-            weights = _weights(model, above)
+            weights = weights_of(model, above)
             by = None if weights is None else ByVertices(models, weights)
             best = None if least is None else least[0]
             g = None if by is None or P is None else _least(by, P, gain**2, best)
@@ -166,7 +166,7 @@ def _worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> tupl
 
 
 @np.errstate(all="ignore")  # what overflows is no P
-def _invariant(by: ByVertices, units: Array) -> Array | None:
+def invariant(by: ByVertices, units: Array) -> Array | None:
     """P with (17) at every corner, as far as floats tell: of the mean of the corners, and of more than that."""
     n, modes = by.order, by.corners[0].model.modes
     for more in _MORE:
@@ -181,7 +181,7 @@ def _invariant(by: ByVertices, units: Array) -> Array | None:
     return None
 
 
-def _weights(model: ErrorModel, above: float) -> Array | None:
+def weights_of(model: ErrorModel, above: float) -> Array | None:
     """What [eta; w] is like, step by step from the last, while the worst w acts; (T, modes, n_eta + nw, the same)."""
     operator = Operator(model)
     swept = sweep(operator, exact_gain(model, width=_WIDTH).high ** 2 * (1.0 + above), _HORIZON)
@@ -202,18 +202,18 @@ def _weights(model: ErrorModel, above: float) -> Array | None:
 def _least(by: ByVertices, P: Array, low: float, best: float | None) -> float | None:
     """The least g at which the recursion comes to Y < g P, as far as floats tell; None: not below `best`."""
     high = low * 1.005 if best is None else best * (1.0 - 2.0 * _CLOSE)
-    while not _ends(by, P, high):
+    while not ends(by, P, high):
         if best is not None or high > _FAR * low:
             return None
         low, high = high, low + 2.5 * (high - low)
     while high > low * (1.0 + _CLOSE):
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if _ends(by, P, middle) else (middle, high)
+        low, high = (low, middle) if ends(by, P, middle) else (middle, high)
     return high
 
 
 @np.errstate(all="ignore")  # what overflows does not end
-def _ends(by: ByVertices, P: Array, g: float) -> bool:
+def ends(by: ByVertices, P: Array, g: float) -> bool:
     Y, n = by.corners[0].start(up=True), by.order
     for steps in range(_MOST_STEPS):
         Z = by.upper(Y, steps)

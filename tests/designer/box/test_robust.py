@@ -17,12 +17,16 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.box.extent import Box, box_of, corners, truth_at, within
+from designer.box.radius import proves, radii
 from designer.box.robust import Robust, robust
 from designer.cli import main
+from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, Ladder
+from designer.model.error_model import error_model, stacked_gains
 from designer.proof.ball_model import Truth
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_vertices import ByVertices, prove
+from designer.proof.prover import Prover
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 
@@ -220,6 +224,24 @@ def test_what_is_proved_of_less_than_the_box_is_false_of_the_box(mutant: str) ->
     P = ByFloats(problem, gains.K, gains.H, forgotten[0]).model.invariants[0]
     assert prove(by, problem.mode_names, honest.gamma * 1.01, P).holds
     assert not prove(by, problem.mode_names, proved.gamma, P).holds
+
+
+def test_the_radius_is_proved_and_not_far_from_where_a_model_exceeds_it() -> None:
+    gains = one_node()
+    problem = gains.problem
+    nominal = Prover(problem, gains.K, gains.H).exact(
+        exact_gain(error_model(problem, *stacked_gains(gains))).high * 1.001
+    )
+    assert nominal.holds
+    (radius,) = radii(problem, gains.K, gains.H, nominal.gamma)
+    assert (radius.name, radius.gamma) == ("probabilities", nominal.gamma * 1.05)
+    assert radius.beyond is not None
+    box = box_of(problem, within([f"probabilities={radius.proved}"]))
+    assert proves(problem, gains.K, gains.H, box, radius.gamma)
+    further = box_of(problem, within([f"probabilities={1.1 * radius.beyond}"]))
+    assert lasts(gains, [truth_at(problem, box, [False], [0])] * 200, radius.gamma)
+    assert not lasts(gains, [truth_at(problem, further, [False], [0])] * 200, radius.gamma)
+    assert f"for {radius.beyond:.4f} that was not proved" in radius.line()
 
 
 def test_the_commands_print_the_rungs_and_say_no(capsys: pytest.CaptureFixture[str]) -> None:
