@@ -93,8 +93,8 @@ class Robust(NamedTuple):
 
 def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robust:
     """The worst model that a search finds, and the least gamma for all: sought in floats, then proved."""
-    ends, rows, gain = _worst(problem, K, H, box)
-    truth = truth_at(problem, box, ends, rows)
+    upper, rows, gain = _worst(problem, K, H, box)
+    truth = truth_at(problem, box, upper, rows)
     values = [float((truth.beta if part.matrix == "beta" else truth.rho)[part.at]) for part in box.intervals]
     if not math.isfinite(gain):
         return Robust(box, gain, values, None)
@@ -102,22 +102,29 @@ def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robu
     models = [ByFloats(problem, K, H, corner) for corner in every]
     nominal = error_model_of(problem, problem.beta, *stacked_links(problem, K, H))
     P = invariant(ByVertices(models, np.zeros(0)), Operator(nominal).units)
+    least = None if P is None else _sought(models, [_model(problem, K, H, truth), nominal], P, gain**2)
+    if P is None or least is None:
+        return Robust(box, gain, values, None)
+    g, by = least
+    for more in _CLAIMED:
+        verdict = prove(by, problem.mode_names, math.sqrt(g) * (1.0 + more), P)
+        if verdict.holds:
+            break
+    return Robust(box, gain, values, verdict)
+
+
+def _sought(models: list[ByFloats], likely: list[ErrorModel], P: Array, low: float) -> tuple[float, ByVertices] | None:
+    """The least g, and the weights that gave it, of those of each likely model; as far as floats tell."""
     least: tuple[float, ByVertices] | None = None
-    for model in (_model(problem, K, H, truth), nominal) if P is not None else ():
+    for model in likely:
         for above in _ABOVE:
             weights = weights_of(model, above)
-            by = None if weights is None else ByVertices(models, weights)
-            best = None if least is None else least[0]
-            g = None if by is None or P is None else _least(by, P, gain**2, best)
-            if by is not None and g is not None:
-                least = g, by
-    verdict = None
-    if least is not None and P is not None:
-        for more in _CLAIMED:
-            verdict = prove(least[1], problem.mode_names, math.sqrt(least[0]) * (1.0 + more), P)
-            if verdict.holds:
-                break
-    return Robust(box, gain, values, verdict)
+            if weights is None:
+                continue
+            by = ByVertices(models, weights)
+            g = _least(by, P, low, None if least is None else least[0])
+            least = least if g is None else (g, by)
+    return least
 
 
 def _differs(one: Truth, other: Truth) -> bool:

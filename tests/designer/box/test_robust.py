@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from made_recordings import random_gains, real_problem, uncertified
+from made_recordings import observer_gains, random_gains, real_problem, uncertified
 from outcomes import moment
 from places import ROOT
 
@@ -66,9 +66,11 @@ def case(name: str) -> Case:
         "seen, links": (True, True, ("probabilities=20%",)),
         "rows": (False, False, ("transition=0.3",)),
         "all": (False, True, ("probabilities=0.05", "transition=0.2")),
+        "from 0 to 1": (False, True, ("probabilities=1",)),
+        "unbiased": (False, True, ("probabilities=0.3",)),
     }[name]
-    problem = real_problem(4, seen=seen, links=links, unbiased=False, ny=(1, 1), modes=2)
-    gains = random_gains(problem)
+    problem = real_problem(4, seen=seen, links=links, unbiased=name == "unbiased", ny=(1, 1), modes=2)
+    gains = observer_gains(problem) if problem.unbiased else random_gains(problem)
     box = box_of(problem, within(texts))
     return Case(gains, box, robust(problem, gains.K, gains.H, box))
 
@@ -80,7 +82,7 @@ def provers(found: Case, every: list[Truth]) -> ByVertices:
     return ByVertices(models, np.tile(np.eye(models[0].model.order), (1, models[0].model.modes, 1, 1)))
 
 
-CASES = ["hidden", "seen, links", "rows", "all"]
+CASES = ["hidden", "seen, links", "rows", "all", "from 0 to 1", "unbiased"]
 
 
 def step(gains: Gains, truth: Truth, Y: Array, g: float) -> Array | None:
