@@ -21,6 +21,7 @@ from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_link
 from agent.contract.problem import Problem
 from designer.beyond_gamma import BeyondGamma, beyond_gamma, told
 from designer.box.extent import Box
+from designer.box.radius import Radius, radii
 from designer.box.robust import Robust, robust
 from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
@@ -66,6 +67,7 @@ class Analysis(NamedTuple):
     unproved: str | None = None  # why no gamma is certified, where the gain is finite
     beyond: BeyondGamma | None = None  # noise, and each node by itself
     robust: Robust | None = None  # what is proved for every model of a box, if one was given
+    radii: tuple[Radius, ...] = ()  # how large boxes may be, if that was asked
 
     @property
     def foreign(self) -> bool:
@@ -99,6 +101,7 @@ class Analysis(NamedTuple):
             },
             **({"white_noise": None, "node_gains": None} if self.beyond is None else self.beyond.document()),
             "within": None if self.robust is None else self.robust.document(),
+            "radii": [radius.document() for radius in self.radii],
         }
 
     def text(self) -> str:
@@ -137,6 +140,7 @@ class Analysis(NamedTuple):
             f"exact gain between {interval(low, high)}, {how}: {_steps(self.horizon)} show that it is no less",
             f"ladder     {rungs}",
             *([] if self.robust is None else self.robust.lines()),
+            *(f"radius     {radius.line()}" for radius in self.radii),
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
             f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
             f"           that is fixed beforehand: gain {self.fixed:.6g} "
@@ -176,8 +180,11 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     return GivenGains(K, H, str(path), file)
 
 
-def analyse(problem: Problem, given: GivenGains, box: Box | None = None) -> Analysis:
-    """The exact gain of the gains on the problem, what attains it, and what holds for every model of a box."""
+def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radius: bool = False) -> Analysis:
+    """The exact gain of the gains on the problem, what attains it, and what holds for every model of a box.
+
+    `radius`: how large boxes may be for a gamma that is a little larger.
+    """
     refuse_nothing_to_estimate(problem)
     model = error_model(problem, *stacked_links(problem, given.K, given.H))
     gain = exact_gain(model)
@@ -212,6 +219,7 @@ def analyse(problem: Problem, given: GivenGains, box: Box | None = None) -> Anal
         unproved=verdict.failure,
         beyond=beyond_gamma(problem, given.K, given.H),
         robust=in_box,
+        radii=tuple(radii(problem, given.K, given.H, verdict.gamma)) if radius and verdict.holds else (),
     )
 
 

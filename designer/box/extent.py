@@ -81,15 +81,15 @@ def within(texts: Sequence[str]) -> dict[str, Tolerance]:
 def _tolerance(text: str, size: str, *, relative: bool) -> Tolerance:
     part, number = size.endswith("%"), size.removesuffix("%")
     try:
-        value = Fraction(number) / (100 if part else 1)
-    except (ValueError, ZeroDivisionError):
-        value = Fraction(-1)
-    if not 0 < value <= 1 or (part and not relative) or not math.isfinite(float(value)):
+        about = float(number)  # a fraction of 1e999999999 would have as many digits
+    except ValueError:
+        about = math.nan
+    if not 0.0 < about <= (100.0 if part else 1.0) or (part and not relative):
         like = "0.02 or 2%" if relative else "0.05"
         raise InputError(
             f'--within {shortened(text)}: "{size}" is no tolerance; it is above 0 and at most 1, like {like}'
         )
-    return Tolerance(value, part)
+    return Tolerance(Fraction(number) / (100 if part else 1), part)
 
 
 def box_of(problem: Problem, tolerances: dict[str, Tolerance]) -> Box:

@@ -93,31 +93,38 @@ class Robust(NamedTuple):
 
 def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robust:
     """The worst model that a search finds, and the least gamma for all: sought in floats, then proved."""
-    ends, rows, gain = _worst(problem, K, H, box)
-    truth = truth_at(problem, box, ends, rows)
+    upper, rows, gain = _worst(problem, K, H, box)
+    truth = truth_at(problem, box, upper, rows)
     values = [float((truth.beta if part.matrix == "beta" else truth.rho)[part.at]) for part in box.intervals]
     if not math.isfinite(gain):
         return Robust(box, gain, values, None)
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))  # the worst first
     models = [ByFloats(problem, K, H, corner) for corner in every]
     nominal = error_model_of(problem, problem.beta, *stacked_links(problem, K, H))
-    P = _invariant(ByVertices(models, np.zeros(0)), Operator(nominal).units)
-    least: tuple[float, ByVertices] | None = None
-    for model in (_model(problem, K, H, truth), nominal) if P is not None else ():
-        for above in _ABOVE:
-            weights = _weights(model, above)
-            by = None if weights is None else ByVertices(models, weights)
-            best = None if least is None else least[0]
-            g = None if by is None or P is None else _least(by, P, gain**2, best)
-            if by is not None and g is not None:
-                least = g, by
-    verdict = None
-    if least is not None and P is not None:
-        for more in _CLAIMED:
-            verdict = prove(least[1], problem.mode_names, math.sqrt(least[0]) * (1.0 + more), P)
-            if verdict.holds:
-                break
+    P = invariant(ByVertices(models, np.zeros(0)), Operator(nominal).units)
+    least = None if P is None else _sought(models, [_model(problem, K, H, truth), nominal], P, gain**2)
+    if P is None or least is None:
+        return Robust(box, gain, values, None)
+    g, by = least
+    for more in _CLAIMED:
+        verdict = prove(by, problem.mode_names, math.sqrt(g) * (1.0 + more), P)
+        if verdict.holds:
+            break
     return Robust(box, gain, values, verdict)
+
+
+def _sought(models: list[ByFloats], likely: list[ErrorModel], P: Array, low: float) -> tuple[float, ByVertices] | None:
+    """The least g, and the weights that gave it, of those of each likely model; as far as floats tell."""
+    least: tuple[float, ByVertices] | None = None
+    for model in likely:
+        for above in _ABOVE:
+            weights = weights_of(model, above)
+            if weights is None:
+                continue
+            by = ByVertices(models, weights)
+            g = _least(by, P, low, None if least is None else least[0])
+            least = least if g is None else (g, by)
+    return least
 
 
 def _differs(one: Truth, other: Truth) -> bool:
@@ -166,7 +173,7 @@ def _worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> tupl
 
 
 @np.errstate(all="ignore")  # what overflows is no P
-def _invariant(by: ByVertices, units: Array) -> Array | None:
+def invariant(by: ByVertices, units: Array) -> Array | None:
     """P with (17) at every corner, as far as floats tell: of the mean of the corners, and of more than that."""
     n, modes = by.order, by.corners[0].model.modes
     for more in _MORE:
@@ -181,7 +188,7 @@ def _invariant(by: ByVertices, units: Array) -> Array | None:
     return None
 
 
-def _weights(model: ErrorModel, above: float) -> Array | None:
+def weights_of(model: ErrorModel, above: float) -> Array | None:
     """What [eta; w] is like, step by step from the last, while the worst w acts; (T, modes, n_eta + nw, the same)."""
     operator = Operator(model)
     swept = sweep(operator, exact_gain(model, width=_WIDTH).high ** 2 * (1.0 + above), _HORIZON)
@@ -202,18 +209,18 @@ def _weights(model: ErrorModel, above: float) -> Array | None:
 def _least(by: ByVertices, P: Array, low: float, best: float | None) -> float | None:
     """The least g at which the recursion comes to Y < g P, as far as floats tell; None: not below `best`."""
     high = low * 1.005 if best is None else best * (1.0 - 2.0 * _CLOSE)
-    while not _ends(by, P, high):
+    while not ends(by, P, high):
         if best is not None or high > _FAR * low:
             return None
         low, high = high, low + 2.5 * (high - low)
     while high > low * (1.0 + _CLOSE):
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if _ends(by, P, middle) else (middle, high)
+        low, high = (low, middle) if ends(by, P, middle) else (middle, high)
     return high
 
 
 @np.errstate(all="ignore")  # what overflows does not end
-def _ends(by: ByVertices, P: Array, g: float) -> bool:
+def ends(by: ByVertices, P: Array, g: float) -> bool:
     Y, n = by.corners[0].start(up=True), by.order
     for steps in range(_MOST_STEPS):
         Z = by.upper(Y, steps)

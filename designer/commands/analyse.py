@@ -34,6 +34,9 @@ def add_analyse(commands: Subcommands) -> None:
         help="rank them with other gains in one table, by gamma; a file, or a method of design; may be repeated",
     )
     add_within(analyse)
+    analyse.add_argument(
+        "--radius", action="store_true", help="the largest such boxes for which 1.05 gamma is proved; takes its time"
+    )
     analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
     analyse.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -49,7 +52,7 @@ def analyse_command(options: argparse.Namespace) -> int:
         refuse_overwrite(options.output, force=options.force)
     box = box_of(problem, within(options.within)) if options.within else None
     given = load_given(options.gains, problem)
-    analysis = analyse(problem, given, box)
+    analysis = analyse(problem, given, box, radius=options.radius)
     facts, text = analysis.document() | {"notes": tell_notes(problem), "output": None}, analysis.text()
     if options.output is not None and analysis.stable:
         gains = certified(problem, given)

@@ -21,6 +21,8 @@ from designer.problems import find
         ("probabilities=-0.1", '"-0.1" is no tolerance'),
         ("probabilities=nan", '"nan" is no tolerance'),
         ("probabilities=1/0", '"1/0" is no tolerance'),
+        ("probabilities=1e999999999", '"1e999999999" is no tolerance'),
+        ("probabilities=1e-999999999", '"1e-999999999" is no tolerance'),
         ("probabilities=150%", '"150%" is no tolerance'),
         ("transition=5%", '"5%" is no tolerance; it is above 0 and at most 1, like 0.05'),
     ],

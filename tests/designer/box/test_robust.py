@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from made_recordings import random_gains, real_problem, uncertified
+from made_recordings import observer_gains, random_gains, real_problem, uncertified
 from outcomes import moment
 from places import ROOT
 
@@ -17,12 +17,16 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.box.extent import Box, box_of, corners, truth_at, within
+from designer.box.radius import proves, radii
 from designer.box.robust import Robust, robust
 from designer.cli import main
+from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, Ladder
+from designer.model.error_model import error_model, stacked_gains
 from designer.proof.ball_model import Truth
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_vertices import ByVertices, prove
+from designer.proof.prover import Prover
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 
@@ -62,9 +66,11 @@ def case(name: str) -> Case:
         "seen, links": (True, True, ("probabilities=20%",)),
         "rows": (False, False, ("transition=0.3",)),
         "all": (False, True, ("probabilities=0.05", "transition=0.2")),
+        "from 0 to 1": (False, True, ("probabilities=1",)),
+        "unbiased": (False, True, ("probabilities=0.3",)),
     }[name]
-    problem = real_problem(4, seen=seen, links=links, unbiased=False, ny=(1, 1), modes=2)
-    gains = random_gains(problem)
+    problem = real_problem(4, seen=seen, links=links, unbiased=name == "unbiased", ny=(1, 1), modes=2)
+    gains = observer_gains(problem) if problem.unbiased else random_gains(problem)
     box = box_of(problem, within(texts))
     return Case(gains, box, robust(problem, gains.K, gains.H, box))
 
@@ -76,7 +82,7 @@ def provers(found: Case, every: list[Truth]) -> ByVertices:
     return ByVertices(models, np.tile(np.eye(models[0].model.order), (1, models[0].model.modes, 1, 1)))
 
 
-CASES = ["hidden", "seen, links", "rows", "all"]
+CASES = ["hidden", "seen, links", "rows", "all", "from 0 to 1", "unbiased"]
 
 
 def step(gains: Gains, truth: Truth, Y: Array, g: float) -> Array | None:
@@ -220,6 +226,24 @@ def test_what_is_proved_of_less_than_the_box_is_false_of_the_box(mutant: str) ->
     P = ByFloats(problem, gains.K, gains.H, forgotten[0]).model.invariants[0]
     assert prove(by, problem.mode_names, honest.gamma * 1.01, P).holds
     assert not prove(by, problem.mode_names, proved.gamma, P).holds
+
+
+def test_the_radius_is_proved_and_not_far_from_where_a_model_exceeds_it() -> None:
+    gains = one_node()
+    problem = gains.problem
+    nominal = Prover(problem, gains.K, gains.H).exact(
+        exact_gain(error_model(problem, *stacked_gains(gains))).high * 1.001
+    )
+    assert nominal.holds
+    (radius,) = radii(problem, gains.K, gains.H, nominal.gamma)
+    assert (radius.name, radius.gamma) == ("probabilities", nominal.gamma * 1.05)
+    assert radius.beyond is not None
+    box = box_of(problem, within([f"probabilities={radius.proved}"]))
+    assert proves(problem, gains.K, gains.H, box, radius.gamma)
+    further = box_of(problem, within([f"probabilities={1.1 * radius.beyond}"]))
+    assert lasts(gains, [truth_at(problem, box, [False], [0])] * 200, radius.gamma)
+    assert not lasts(gains, [truth_at(problem, further, [False], [0])] * 200, radius.gamma)
+    assert f"for {radius.beyond:.4f} that was not proved" in radius.line()
 
 
 def test_the_commands_print_the_rungs_and_say_no(capsys: pytest.CaptureFixture[str]) -> None:
