@@ -1,0 +1,147 @@
+"""The checker in tools/, which shares no line with peakmesh, beside `verify`, on files of every kind."""
+
+from __future__ import annotations
+
+import ast
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from agent.contract.gains import Gains
+from designer.proof.certificate import verify
+
+CHECKER = ROOT / "tools" / "check_certificate.py"
+CORRECT, INCORRECT = (
+    sorted((ROOT / "tools" / "certificates" / kind).glob("*.json")) for kind in ("correct", "incorrect")
+)
+DESIGNED = [*CORRECT, *sorted((ROOT / "recordings" / "golden").glob("*.gains.json"))]
+PROVED, DISPROVED, UNDECIDED = 0, 1, 3
+
+
+@pytest.fixture
+def check(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """The checker as it is called: its exit code, and what it prints."""
+
+    def run(path: Path, checker: Path = CHECKER) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", [str(checker), str(path)])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(checker), run_name="__main__")
+        return ended.value.code, capsys.readouterr().out
+
+    return run
+
+
+def edited(path: Path, to: Path, **changes: object) -> Path:
+    """The file with other entries of its certificate."""
+    document = json.loads(path.read_text())
+    document["certificate"] |= changes
+    to.write_text(json.dumps(document))
+    return to
+
+
+@pytest.mark.parametrize("path", DESIGNED, ids=lambda path: path.stem)
+def test_what_is_designed_is_proved(path: Path, check) -> None:
+    code, said = check(path)
+    assert (code, said.split(":")[0]) == (PROVED, "proved")
+    assert str(Gains.load(path).certificate.gamma) in said
+    assert verify(Gains.load(path)).holds
+
+
+@pytest.mark.parametrize("path", INCORRECT, ids=lambda path: path.stem)
+def test_what_claims_too_much_is_disproved(path: Path, check) -> None:
+    """One number of a correct file is moved: by `verify` it is false, by the checker too, with a vector."""
+    code, said = check(path)
+    assert (code, said.split(":")[0]) == (DISPROVED, "disproved")
+    assert float(said.split("v'Xv = ")[1].split()[0]) <= 0.0
+    assert not verify(Gains.load(path)).holds
+
+
+def test_every_kind_of_number_is_moved() -> None:
+    moved = {path.stem.split("-")[0] for path in INCORRECT}
+    assert moved == {"A", "B", "C", "D", "M", "K", "H", "P", "Q", "R", "Pi", "beta", "rho", "gamma", "weight"}
+    kinds = {(claim.kind, claim.form) for path in CORRECT for claim in [Gains.load(path).certificate]}
+    assert kinds == {("exact", "summed"), ("exact", "structured"), ("exact", "full"), ("lyapunov", "structured")}
+
+
+@pytest.mark.parametrize("path", DESIGNED, ids=lambda path: path.stem)
+def test_a_gamma_that_is_lower_is_not_proved(path: Path, check, tmp_path: Path) -> None:
+    """Below the lower end of the exact gain nothing is proved, and W or (18) shows it."""
+    claim = Gains.load(path).certificate
+    assert claim.exact is not None
+    lower = edited(path, tmp_path / "lower.json", gamma=claim.exact[0] * (1.0 - 1e-9))
+    assert check(lower)[0] == DISPROVED
+
+
+@pytest.mark.parametrize("kind", ["lyapunov", "whatever"])
+def test_a_kind_is_not_believed(kind: str, check, tmp_path: Path) -> None:
+    """A file that says of a gamma below the exact gain that it is of another kind is not proved for that."""
+    path = next(path for path in CORRECT if path.stem == "paper-theorem2")
+    gamma = Gains.load(path).certificate.gamma
+    assert check(edited(path, tmp_path / "other.json", kind=kind, gamma=0.99 * gamma))[0] == DISPROVED
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("gamma", "no_gamma"), ('"gamma":', '"gamma":NaN,"old":'), ("{", "[")],
+)
+def test_what_cannot_be_read_is_undecided(old: str, new: str, check, tmp_path: Path) -> None:
+    path = tmp_path / "gains.json"
+    path.write_text(CORRECT[0].read_text().replace(old, new))
+    code, said = check(path)
+    assert (code, said.split(":")[0]) == (UNDECIDED, "undecided")
+
+
+def test_no_probability_is_above_1(check, tmp_path: Path) -> None:
+    """What is negative of a variance would make up for anything."""
+    document = json.loads(CORRECT[0].read_text())
+    document["problem"]["node"][0]["arrival_probability"] = 1.5
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    assert check(path)[0] == UNDECIDED
+
+
+def test_the_own_gain_of_an_unbiased_node_is_the_exact_one(check, tmp_path: Path) -> None:
+    """A less all others, as the node steps by; the one in the file, which is that rounded, is not used."""
+    document = json.loads(next(path for path in CORRECT if path.stem == "unbiased").read_text())
+    document["K"]["m0"]["n0"]["n0"] = [[99.0]]
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    assert check(path)[0] == PROVED
+
+
+BROKEN = {  # a line of the checker, what is wrong with it, and a file on which it then errs
+    "nothing is left to chance": ("return more | {", "return {", "beta-hidden"),
+    "links are not": ("if 0 < p < 1}", 'if 0 < p < 1 and name[0] == "theta"}', "rho"),
+    "all is delivered": ("rho.get((names[i], names[j]), Q(1))", "Q(1)", "Pi-links"),
+    "seen is hidden": ("if seen[j] else total", "if not seen[j] else total", "beta-seen"),
+    "x is left out": ('0 if p.get("unbiased") and', "0 if", "gamma-links"),
+    "no weights": ("scaled(K_i[names[j]], a[j])", "K_i[names[j]]", "unbiased"),
+    "modes as likely": ("a / sum(row) for a in row", "Q(1, len(Pi)) for a in row", "paper-exact"),
+    "(17) holds": ("less(blocks(eye(nw), P_s), S(P, s))", "eye(1)", "H-theorem2"),
+    "(18) holds": ("less(P_s, scaled(MM, 1 / gamma**2))", "P_s", "gamma-beside"),
+    "any end is one": ("above(gP, Y))[0]", "True)[0]", "D"),
+    "twice g": ("eye(nw, g), zeros", "eye(nw, 2 * g), zeros", "H"),
+    "all pivots are positive": ("if pivot <= 0", "if pivot == 0", "gamma"),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_checker_that_is_wrong_is_found_out(what: str, check, tmp_path: Path) -> None:
+    old, new, stem = BROKEN[what]
+    text = CHECKER.read_text()
+    assert text.count(old) == 1
+    broken = tmp_path / "broken.py"
+    broken.write_text(text.replace(old, new))
+    path = next(path for path in CORRECT + INCORRECT if path.stem == stem)
+    assert (check(path, broken)[0] == PROVED) is (path in INCORRECT)
+
+
+def test_it_is_short_and_by_itself() -> None:
+    text = CHECKER.read_text()
+    imported = {name.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)}
+    assert imported == {"json", "sys", "fractions", "math"}
+    assert len(text.splitlines()) <= 120
