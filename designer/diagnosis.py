@@ -7,8 +7,9 @@ outside S reaches S and no measurement of S with C_j v != 0 arrives. Start every
 that goes on, the innovations of S are 0, the differences between its estimates are 0, and every error is lambda^k v.
 So E|e_i(k)|^2 >= (q |lambda|^2)^k |v|^2, whatever the gains: q |lambda|^2 < 1 is necessary for mean-square stability.
 q = 1 is a node that is blind for ever. It has to hold in every class of modes that is never left, since gamma is for
-any initial mode. That it does not hold is proved here without a solver; where it holds, and no design was found all
-the same, parts of the problem are relaxed in turn to see which of them is in the way. docs/theory.md, section 10.
+any initial mode. A node that hears nobody needs more: the volume that its errors fill has to shrink. That it does not
+hold is proved here without a solver; where it holds, and no design was found all the same, parts of the problem are
+relaxed in turn to see which of them is in the way. docs/theory.md, section 10.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.problem import Problem
 from designer.model.units import natural_units
-from designer.proof.hidden import grows_unseen
+from designer.proof.hidden import grows_unseen, volume_grows
 
 _NEARLY_UNSTABLE = 0.999
 _RARELY = 0.05  # an arrival or delivery probability below this is worth a word
@@ -97,6 +98,7 @@ def obstacles(problem: Problem) -> list[str]:
                     found += _as_proved(text, problem, [int(j) for j in heard], chance=1.0)
                 else:
                     found += _too_many_losses(problem, i, eigenvalue, sees, upstream[i], adjacency[i])
+    found += [] if found else _too_fast(problem)
     return list(dict.fromkeys(found))
 
 
@@ -210,6 +212,29 @@ def _too_many_losses(
         )
         return _as_proved(text, problem, [] if sees[i] else [i], chance=cut)
     return []
+
+
+def _too_fast(problem: Problem) -> list[str]:
+    """Nodes that hear nobody, in a mode that is never left: the volume that their errors fill has to shrink."""
+    found: list[str] = []
+    sizes = np.abs(np.linalg.eigvals(_scaled(problem)[0]))
+    volume = float(np.prod(sizes[sizes > 1.0]))
+    for modes in closed_classes(problem):
+        for i, node in enumerate(problem.nodes if len(modes) == 1 else ()):
+            rows, beta = len(node.C), node.arrival_probability
+            grows = problem.neighbours(modes[0], i) == (i,) and (1.0 - beta) ** rows * volume**2 >= 1.0
+            proved = volume_grows(problem.plant.A, beta, rows) if grows else False
+            if proved is False:
+                continue
+            power = f"^{rows}" if rows > 1 else ""
+            text = (
+                f'no constant gain exists: node "{node.name}" hears nobody in mode "{problem.mode_names[modes[0]]}", '
+                f"the unstable eigenvalues of A multiply to {volume:.6g}, and (1 - {beta:g}){power} x {volume:.6g}^2 = "
+                f"{(1.0 - beta) ** rows * volume**2:.6g} has to be below 1; "
+                f"arrival_probability must be above {1.0 - volume ** (-2.0 / rows):.6g}"
+            )
+            found.append(text if proved else text + _COMPUTED)
+    return found
 
 
 def _growth(chance: float, factor: float) -> str:

@@ -9,7 +9,21 @@ from agent.contract.problem import Problem
 
 
 def notes(problem: Problem) -> list[str]:
-    """A column of w that is several things at once, in a sentence that says what gamma then is."""
+    """Each a sentence: a matrix of continuous time, a column of w that is several things at once."""
+    return [*_continuous(problem), *_shared(problem)]
+
+
+def _continuous(problem: Problem) -> list[str]:
+    if not (np.linalg.eigvals(problem.plant.A).real < 0.0).all():
+        return []
+    return [
+        "every eigenvalue of A has a negative real part, as of a continuous-time model; A must be of "
+        "x(k+1) = A x(k) + B w(k), exp(A T) of a plant that is sampled every T"
+    ]
+
+
+def _shared(problem: Problem) -> list[str]:
+    """What gamma is where a column of w is several things at once."""
     moves = np.any(problem.plant.B != 0.0, axis=0)
     disturbs = np.array([np.any(node.D != 0.0, axis=0) for node in problem.nodes])
     shared = [int(column) for column in np.flatnonzero(disturbs.sum(axis=0) + moves > 1) if disturbs[:, column].any()]

@@ -1,4 +1,4 @@
-"""Whether a part of the plant grows that some measurements never show: exactly, from the floats as they stand."""
+"""Whether a part of the plant grows that measurements never show, or too rarely: exactly, from floats as they are."""
 
 from __future__ import annotations
 
@@ -32,6 +32,23 @@ def grows_unseen(A: Array, C: Array, chance: float) -> bool | None:
         if any(size >= 1 for size in sizes):
             return True
         return False if len(values) == size and all(size < 1 for size in sizes) else None
+
+
+def volume_grows(A: Array, beta: float, rows: int) -> bool | None:
+    """Whether (1 - beta)^rows |det A_u|^2 >= 1, A_u of the eigenvalues of A with |lambda| > 1; None: not decided."""
+    with ctx.workprec(_BITS):
+        try:
+            values = acb_mat(arb_mat(_rational(A))).eig(multiple=True)
+        except ValueError:
+            return None
+        least = most = (1 - arb(beta)) ** rows
+        for size in (abs(value) ** 2 for value in values):
+            if not size < 1:
+                most = most * size.max(arb(1))
+                least = least * size if size >= 1 else least
+        if least >= 1:
+            return True
+        return False if len(values) == len(A) and most < 1 else None
 
 
 def _rational(matrix: Array) -> fmpq_mat:

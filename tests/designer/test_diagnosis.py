@@ -16,7 +16,7 @@ from designer.cli import main
 from designer.diagnosis import closed_classes, explained, obstacles, warnings
 from designer.problems import find
 from designer.problems.notes import notes
-from designer.proof.hidden import grows_unseen
+from designer.proof.hidden import grows_unseen, volume_grows
 from designer.synthesis import design
 
 
@@ -396,3 +396,57 @@ def test_what_grows_unseen_is_decided_exactly(
     A: list[list[float]], C: list[list[float]], chance: float, grows: bool
 ) -> None:
     assert grows_unseen(np.array(A), np.array(C).reshape(-1, 2), chance) is grows
+
+
+# what one node needs that hears nobody
+CRITICAL = {
+    "scalar": ([[1.25]], [1.0], 0.36),
+    "two growing states, one measurement": ([[1.25, 0.0], [1.0, 1.1]], [1.0, 1.0], 1.0 - 1.0 / (1.25 * 1.1) ** 2),
+    "one growing state of three": ([[1.25, 1.0, 0.0], [0.0, 0.9, 7.0], [0.0, 0.0, 0.6]], [1.0, 0.0, 2.0], 0.36),
+}
+
+
+@pytest.mark.parametrize("case", CRITICAL)
+def test_the_critical_arrival_probability_of_intermittent_observations(case: str) -> None:
+    """Known from the literature: 1 - 1/prod |lambda|^2, here 0.36, 0.4711 and 0.36. Just above, gains are certified."""
+    A, C, critical = CRITICAL[case]
+    alone = {"A": A, "sees": {"1": C}, "hears": [{}]}
+    below, above = (network(**alone, beta={"1": critical + off}) for off in (-0.001, 0.02))
+    with pytest.raises(Unattainable, match=f"has no solution: .* must be above {critical:.6g}$"):
+        design(below)
+    assert obstacles(network(**alone, beta={"1": critical + 0.0001})) == []
+    assert design(above, method="least-variance").certificate.holds
+
+
+def test_that_no_constant_gain_exists_is_said() -> None:
+    """Where no eigenvalue alone is in the way, but all together are; another node that listens helps nobody."""
+    A, C, critical = CRITICAL["two growing states, one measurement"]
+    sees = {"1": C, "2": [0.0, 0.0]}
+    (found,) = obstacles(network(A=A, sees=sees, hears=[{"2": ["1"]}], beta={"1": 0.46}))
+    assert found == (
+        'no constant gain exists: node "1" hears nobody in mode "a", the unstable eigenvalues of A multiply to 1.375, '
+        f"and (1 - 0.46) x 1.375^2 = 1.02094 has to be below 1; arrival_probability must be above {critical:.6g}"
+    )
+    heard = network(A=A, sees={"1": C, "2": C}, hears=[{"1": ["2"], "2": ["1"]}], beta={"1": 0.46, "2": 0.46})
+    assert obstacles(heard) == []
+
+
+def test_whether_a_volume_grows_is_decided_by_balls() -> None:
+    A = np.array([[1.25, 0.0], [1.0, 1.1]])
+    critical = 1.0 - 1.0 / 1.375**2
+    assert volume_grows(A, critical - 1e-15, 1) is True
+    assert volume_grows(A, critical + 1e-15, 1) is False
+    assert volume_grows(A, critical - 1e-15, 2) is False
+    assert volume_grows(np.array([[2.0]]), 0.75, 1) is True
+    assert volume_grows(np.array([[0.0, 1.25], [-1.25, 0.0]]), 0.59, 1) is True  # 0.59 < 1 - 1 / 1.25^4 = 0.5904
+    assert volume_grows(np.array([[0.0, 1.25], [-1.25, 0.0]]), 0.591, 1) is False
+
+
+def test_a_continuous_time_matrix_is_noted() -> None:
+    """And no other: one eigenvalue that is not negative is enough."""
+    document = random_problem(4).document()
+    document["plant"]["A"] = [[-0.01, -0.992], [0.0, -0.75]]
+    (found,) = [text for text in notes(Problem.from_document(document)) if "continuous" in text]
+    assert found.startswith("every eigenvalue of A has a negative real part, as of a continuous-time model; A must be")
+    document["plant"]["A"] = [[0.01, -0.992], [0.0, -0.75]]
+    assert not any("continuous" in text for text in notes(Problem.from_document(document)))
