@@ -27,7 +27,7 @@ def add_export(commands: Subcommands) -> None:
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="recording, or the parts of one; cut ones too; with --c a gains file",
+        help="recording, or the parts of one, cut ones too; with --c, --npz or --mat a gains file",
     )
     add_choice(export)
     to = export.add_mutually_exclusive_group(required=True)
@@ -36,7 +36,14 @@ def add_export(commands: Subcommands) -> None:
     )
     to.add_argument("--parquet", action="store_const", dest="to", const="parquet", help="the same in binary")
     to.add_argument(
-        "--mat", action="store_const", dest="to", const="mat", help="arrays for MATLAB, a row for each step"
+        "--npz", action="store_const", dest="to", const="npz", help="of gains: K and H as one matrix for each mode"
+    )
+    to.add_argument(
+        "--mat",
+        action="store_const",
+        dest="to",
+        const="mat",
+        help="the same for MATLAB; of a recording a row for each step",
     )
     to.add_argument(
         "--c", action="store_const", dest="to", const="c", help="a node's filter as C99 for a device, with a self-test"
@@ -127,6 +134,8 @@ def _export_table(options: argparse.Namespace) -> int:
 
     if options.wide and options.to == "mat":
         raise InputError("--wide is for --csv and --parquet; a .mat file has arrays")
+    if options.to == "npz" or [path.suffix for path in options.recordings] == [".json"]:
+        return _export_gains(options)
     output = options.output or options.recordings[0].with_suffix(f".{options.to}")
     refuse_overwrite(output, force=options.force)
     tell = Progress()
@@ -139,6 +148,20 @@ def _export_table(options: argparse.Namespace) -> int:
     if facts["absent"]:
         print(f"{counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr)
     print(json.dumps(facts) if options.json else _text(facts))
+    return EXIT_GOOD
+
+
+def _export_gains(options: argparse.Namespace) -> int:
+    """`peakmesh export GAINS --npz` or `--mat`."""
+    from designer import stacked
+
+    path, *more = options.recordings
+    if more or f".{options.to}" not in stacked.SUFFIXES:
+        raise InputError(f"{path}: gains are exported one file at a time, by --npz or --mat; --{options.to} is no such")
+    gains, output = load_gains(path), options.output or path.with_suffix(f".{options.to}")
+    facts = stacked.save(gains, output, to=options.to, force=options.force)
+    size = " and ".join(f"{letter} {' x '.join(map(str, facts[letter]))}" for letter in ("K", "H"))
+    print(json.dumps(facts) if options.json else f"{counted(facts['modes'], 'mode')}, {size}\ngains      {output}")
     return EXIT_GOOD
 
 
