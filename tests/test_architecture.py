@@ -57,6 +57,7 @@ ROOMS = {
     "designer.ladder": "designer.lmi",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
+    "designer.stacked": "designer.model",
     "designer.box": "designer.decay designer.gain designer.model designer.proof",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.model designer.proof designer.search designer.stacked",

@@ -74,6 +74,8 @@ def export_command(options: argparse.Namespace) -> int:
         return _export_c(options)
     for name in (name for name, value in only_c.items() if value):
         raise InputError(f"{name} is for --c; a recording is exported whole")
+    if options.to == "npz" or (options.to == "mat" and options.recordings[0].suffix == ".json"):
+        return _export_gains(options)
     return _export_table(options)
 
 
@@ -134,8 +136,6 @@ def _export_table(options: argparse.Namespace) -> int:
 
     if options.wide and options.to == "mat":
         raise InputError("--wide is for --csv and --parquet; a .mat file has arrays")
-    if options.to == "npz" or [path.suffix for path in options.recordings] == [".json"]:
-        return _export_gains(options)
     output = options.output or options.recordings[0].with_suffix(f".{options.to}")
     refuse_overwrite(output, force=options.force)
     tell = Progress()
@@ -156,8 +156,10 @@ def _export_gains(options: argparse.Namespace) -> int:
     from designer import stacked
 
     path, *more = options.recordings
-    if more or f".{options.to}" not in stacked.SUFFIXES:
-        raise InputError(f"{path}: gains are exported one file at a time, by --npz or --mat; --{options.to} is no such")
+    if more:
+        raise InputError(f"--{options.to} takes one gains file, not {1 + len(more)}")
+    for name in (name for name in ("wide", "run", "gains") if getattr(options, name)):
+        raise InputError(f"--{name} says something of a recording; {path} is to be a gains file")
     gains, output = load_gains(path), options.output or path.with_suffix(f".{options.to}")
     facts = stacked.save(gains, output, to=options.to, force=options.force)
     size = " and ".join(f"{letter} {' x '.join(map(str, facts[letter]))}" for letter in ("K", "H"))

@@ -138,9 +138,13 @@ def test_what_is_no_such_file_is_said(suffix: str, tmp_path: Path) -> None:
             load_given(path, GAINS.problem)
 
 
-def test_gains_go_into_no_table(capsys: pytest.CaptureFixture[str]) -> None:
-    """Nor a recording into matrices of gains."""
-    assert main(["export", str(GOLDEN), "--csv"]) == 2
-    assert "gains are exported one file at a time, by --npz or --mat" in capsys.readouterr().err
-    assert main(["export", str(GOLDEN.with_name("zhu2020-lossy.mcap")), "--npz"]) == 2
-    assert "is not a gains file" in capsys.readouterr().err
+def test_a_recording_goes_into_no_matrices_of_gains(capsys: pytest.CaptureFixture[str]) -> None:
+    """Nor do two gains files, or what is said of recordings."""
+    recording = str(GOLDEN.with_name("zhu2020-lossy.mcap"))
+    for words, said in (
+        ((recording, "--npz"), "is not a gains file"),
+        ((str(GOLDEN), str(GOLDEN), "--mat"), "--mat takes one gains file, not 2"),
+        ((str(GOLDEN), "--npz", "--run", "r"), "--run says something of a recording"),
+    ):
+        assert main(["export", *words]) == 2
+        assert said in capsys.readouterr().err
