@@ -2,7 +2,8 @@
 
 The gains may be those of a gains file, which may have been designed for another problem of the same shape, or somebody
 else's in a plain JSON file: {"K": {mode: {i: {j: rows}}}, "H": the same}, where i receives from j, and the filter (5)
-multiplies K_ij and H_ij by a_ij. The problem that they are analysed on is the one that is given, not the file's.
+multiplies K_ij and H_ij by a_ij; or one matrix for each mode (stacked.py).
+The problem that they are analysed on is the one that is given, not the file's.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from agent.contract.errors import InputError, first_fault
 from agent.contract.files import read_bytes, read_json
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
+from designer import stacked
 from designer.beyond_gamma import BeyondGamma, beyond_gamma, told
 from designer.box.extent import Box
 from designer.box.radius import Radius, radii
@@ -153,6 +155,8 @@ class Analysis(NamedTuple):
 
 def load_given(path: Path, problem: Problem) -> GivenGains:
     """Read gains for the links of `problem`. Raises InputError: one sentence for what does not fit."""
+    if path.suffix in stacked.SUFFIXES:
+        return GivenGains(*stacked.load(path, problem), str(path), None)
     data = read_bytes(path, kind="gains file")
     try:
         document = read_json(data)
@@ -160,6 +164,7 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
         document = None
     file = None
     if isinstance(document, dict) and "format" not in document and {"K", "H"} & set(document):
+        document = _unstacked(document, problem, path)
         try:
             plain = _Plain.model_validate(document)
         except ValidationError as error:
@@ -178,6 +183,19 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     except ValueError as error:
         raise InputError(f"{path} does not fit {problem.name}: {error}") from None
     return GivenGains(K, H, str(path), file)
+
+
+def _unstacked(document: dict[str, Any], problem: Problem, path: Path) -> dict[str, Any]:
+    """The document with gains for links, where it has one matrix for each mode."""
+    some = document.get("K")
+    some = next(iter(some.values()), None) if isinstance(some, dict) else some
+    if not isinstance(some, list) or set(document) != {"K", "H"}:
+        return document
+    try:
+        K, H = stacked.unstacked(problem, document["K"], document["H"])
+    except ValueError as error:
+        raise InputError(f"{path} does not fit {problem.name}: {error}") from None
+    return {"K": K, "H": H}
 
 
 def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radius: bool = False) -> Analysis:

@@ -57,9 +57,10 @@ ROOMS = {
     "designer.ladder": "designer.lmi",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model",
     "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
+    "designer.stacked": "designer.model",
     "designer.box": "designer.decay designer.gain designer.model designer.proof",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
-    "designer.model designer.proof designer.search",
+    "designer.model designer.proof designer.search designer.stacked",
     "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
@@ -79,8 +80,8 @@ ROOMS = {
     "designer.commands": "agent.commands agent.contract.recording agent.embed agent.signals designer.analysis "
     "designer.beyond_gamma designer.box designer.compare designer.diagnosis designer.export designer.gain "
     "designer.identify designer.ladder designer.problems designer.proof designer.ranking designer.replay "
-    "designer.report designer.reproduce designer.search designer.show designer.simulation designer.sweep "
-    "designer.synthesis designer.watch designer.what_if",
+    "designer.report designer.reproduce designer.search designer.show designer.simulation "
+    "designer.stacked designer.sweep designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
 }
@@ -103,6 +104,7 @@ DOORS = {
         "designer/proof/machine.py",
         "designer/identify/fit.py",
         "designer/export/matlab.py",
+        "designer/stacked.py",
     ],
     "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],

@@ -21,7 +21,11 @@ def add_analyse(commands: Subcommands) -> None:
     analyse.add_argument("problem", metavar="PROBLEM", help=PROBLEM)
     add_set(analyse)
     analyse.add_argument(
-        "--gains", type=Path, required=True, metavar="FILE", help='gains file, or a plain JSON with "K" and "H" alone'
+        "--gains",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help='gains file, or "K" and "H" alone, as JSON, .npz or .mat',
     )
     analyse.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write them as a gains file, their exact gain certified"

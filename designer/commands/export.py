@@ -27,7 +27,7 @@ def add_export(commands: Subcommands) -> None:
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="recording, or the parts of one; cut ones too; with --c a gains file",
+        help="recording, or the parts of one, cut ones too; with --c, --npz or --mat a gains file",
     )
     add_choice(export)
     to = export.add_mutually_exclusive_group(required=True)
@@ -36,7 +36,14 @@ def add_export(commands: Subcommands) -> None:
     )
     to.add_argument("--parquet", action="store_const", dest="to", const="parquet", help="the same in binary")
     to.add_argument(
-        "--mat", action="store_const", dest="to", const="mat", help="arrays for MATLAB, a row for each step"
+        "--npz", action="store_const", dest="to", const="npz", help="of gains: K and H as one matrix for each mode"
+    )
+    to.add_argument(
+        "--mat",
+        action="store_const",
+        dest="to",
+        const="mat",
+        help="the same for MATLAB; of a recording a row for each step",
     )
     to.add_argument(
         "--c", action="store_const", dest="to", const="c", help="a node's filter as C99 for a device, with a self-test"
@@ -67,6 +74,8 @@ def export_command(options: argparse.Namespace) -> int:
         return _export_c(options)
     for name in (name for name, value in only_c.items() if value):
         raise InputError(f"{name} is for --c; a recording is exported whole")
+    if options.to == "npz" or (options.to == "mat" and options.recordings[0].suffix == ".json"):
+        return _export_gains(options)
     return _export_table(options)
 
 
@@ -140,6 +149,22 @@ def _export_table(options: argparse.Namespace) -> int:
     if facts["absent"]:
         print(f"{counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr)
     print(json.dumps(facts) if options.json else _text(facts))
+    return EXIT_GOOD
+
+
+def _export_gains(options: argparse.Namespace) -> int:
+    """`peakmesh export GAINS --npz` or `--mat`."""
+    from designer import stacked
+
+    path, *more = options.recordings
+    if more:
+        raise InputError(f"--{options.to} takes one gains file, not {1 + len(more)}")
+    for name in (name for name in ("wide", "run", "gains") if getattr(options, name)):
+        raise InputError(f"--{name} says something of a recording; {path} is to be a gains file")
+    gains, output = load_gains(path), options.output or path.with_suffix(f".{options.to}")
+    facts = stacked.save(gains, output, to=options.to, force=options.force)
+    size = " and ".join(f"{letter} {' x '.join(map(str, facts[letter]))}" for letter in ("K", "H"))
+    print(json.dumps(facts) if options.json else f"{counted(facts['modes'], 'mode')}, {size}\ngains      {output}")
     return EXIT_GOOD
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 from agent.commands.options import Subcommands, add_command
@@ -12,6 +13,27 @@ from agent.contract.errors import EXIT_GOOD, InputError
 from agent.contract.files import refuse_overwrite, write_whole
 from designer.commands import add_set
 from designer.commands.recordings import Progress, add_choice
+
+CITATION = """\
+@software{{peakmesh,
+  title = {{peakmesh: design, run and audit distributed peak-error filters}},
+  version = {{{version}}},
+  license = {{Apache-2.0}},
+  year = {{2026}}
+}}
+
+@article{{zhu2020distributed,
+  title = {{Distributed $l_2$-$l_\\infty$ filtering for sensor networks with missing measurements
+    and switching topology}},
+  author = {{Zhu, F. and Wen, J. and Peng, L. and Yang, R.}},
+  journal = {{Control and Decision}},
+  volume = {{35}},
+  number = {{8}},
+  pages = {{1841--1848}},
+  year = {{2020}},
+  doi = {{10.13195/j.kzyjc.2018.1301}}
+}}
+"""
 
 
 def add_show(commands: Subcommands) -> None:
@@ -22,6 +44,7 @@ def add_show(commands: Subcommands) -> None:
     show.add_argument(
         "--toml", action="store_true", help="a problem as its file, also a built-in one, or that of a gains file"
     )
+    show.add_argument("--cite", action="store_true", help="how to cite peakmesh and the paper, as BibTeX")
     add_choice(show)
     show.add_argument(
         "--get", metavar="NAME", help="take an attachment out of a recording: layout.json, gains.json or problem.json"
@@ -35,6 +58,9 @@ def show_command(options: argparse.Namespace) -> int:
     """`peakmesh show [FILE]`."""
     from designer import show
 
+    if options.cite:
+        print(CITATION.format(version=version("peakmesh")), end="")
+        return EXIT_GOOD
     if options.toml:
         return _toml(options)
     if options.get is not None:

@@ -302,7 +302,7 @@ def test_a_table_that_cannot_be_written_leaves_nothing(
         (["--mat", "--wide"], "--wide is for --csv and --parquet"),
         (["--csv", "-o", "nowhere/table.csv"], "the folder nowhere does not exist"),
         (["--csv", "-o", "."], "is a folder"),
-        ([], "one of the arguments --csv --parquet --mat --c is required"),
+        ([], "one of the arguments --csv --parquet --npz --mat --c is required"),
         (["--csv", "--mat"], "not allowed with"),
     ],
 )
