@@ -24,6 +24,8 @@ class Receipts:
         self.messages = 0  # taken
         self.received: dict[str, int] = {}  # of each sender, the messages without a gap
         self.lost: dict[str, int] = {}  # of each sender, messages that went with a process before this one
+        self.void: defaultdict[str, set[int]] = defaultdict(set)  # of each sender, numbers of those, and of copies
+        self._gone: dict[str, int] = {}  # of each sender that has lost some, the last step seen before
         self.reached: dict[str, int] = {}  # of each sender, the last step seen
 
     def take(self, topic: str, step: int, stamp: Stamp | None) -> bool:
@@ -33,6 +35,8 @@ class Receipts:
         self.messages += 1
         sender = stamp.sender if stamp is not None else f"sensor of {topic}"
         self.reached[sender] = max(step, self.reached.get(sender, 0))
+        if topic == MODE and stamp is not None and step <= self._gone.get(sender, -1):
+            self._given_again(stamp, step)
         if step >= self.complete and topic in self._topics:
             self._there[step].add(topic)
             while len(self._there.get(self.complete, ())) == len(self._topics):
@@ -54,9 +58,18 @@ class Receipts:
         """Expect the number after the last one that is there: whoever used those before is gone."""
         early = self._early[sender]
         if early:
-            self.lost[sender] = self.lost.get(sender, 0) + self.missing(sender)
+            self.lost[sender] = self.missing(sender)
+            self.void[sender] |= set(range(self.received.get(sender, 0), max(early))) - early
             self.received[sender] = max(early) + 1
+            self._gone[sender] = self.reached[sender]
             early.clear()
+
+    def _given_again(self, stamp: Stamp, step: int) -> None:
+        """A mode under a new number: the one that was lost, or a copy of one that is there."""
+        if step < self.complete or MODE in self._there.get(step, ()):
+            self.void[stamp.sender].add(stamp.number)
+        else:
+            self.lost[stamp.sender] -= 1
 
     def _number(self, sender: str, number: int) -> bool:
         expected, early = self.received.get(sender, 0), self._early[sender]

@@ -15,6 +15,7 @@ from agent.contract.keys import EVIDENCE, decode, model_of, sender_of
 from agent.contract.messages import Account, Event, Evidence, Stamp, digest_of
 from agent.contract.recording import Logged
 from agent.contract.recording.evidence.chains import Chains
+from agent.contract.recording.ranges import in_ranges
 from agent.contract.recording.resumption import Cut
 from agent.contract.recording.writer import RecordingWriter, Split
 from agent.receipts import Receipts
@@ -162,6 +163,7 @@ class Record:
             end[f"received.{who}"] = str(receipts.received.get(who, 0))
             end[f"reached.{who}"] = str(receipts.reached[who])
             end[f"missing.{who}"] = str(receipts.missing(who))  # before the last that is there
+        end |= {f"void.{who}": in_ranges(numbers) for who, numbers in sorted(receipts.void.items()) if numbers}
         return end | {f"head.{who}": head for who, head in self._chains.heads().items()}
 
     @contextmanager

@@ -26,8 +26,8 @@ cannot be right where no checksum covers it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +86,7 @@ class Facts:
     event_copies: int
     recorded: dict[str, int]  # messages of each sender by the word of the recorder; empty where it is not known
     unplanned: frozenset[str]  # topics that the run need not have
+    void: Mapping[str, Sequence[range]] = field(default_factory=dict)  # of each sender, numbers that nobody looks for
     excused: Flags | None = None  # (steps, topics): what nobody was there to send, in a paced run
 
 
@@ -118,7 +119,13 @@ def take_census(
     holes = _holes(topics, columns, facts.steps, facts.excused)
     lacking_of = Counter({topic.topic: int(holes.length[holes.topic == at].sum()) for at, topic in enumerate(topics)})
     numbering = read_numbering(
-        topics, columns, lacking_of, steps=facts.steps, events=facts.events, recorded=facts.recorded
+        topics,
+        columns,
+        lacking_of,
+        steps=facts.steps,
+        events=facts.events,
+        recorded=facts.recorded,
+        void=facts.void,
     )
     lacks, is_part = _explained(holes, topics, facts)
     is_part |= numbering.is_part

@@ -20,9 +20,10 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
 from agent.contract.keys import ACCOUNT, COORDINATOR, EVENT, EVIDENCE, PLANT, PLANT_STATE, measurement
-from agent.contract.messages import Account, Event
+from agent.contract.messages import GONE, Account, Event
 from agent.contract.recording import Logged
 from agent.contract.recording.evidence.examiner import Examiner, Findings
+from agent.contract.recording.ranges import ranges_of
 from agent.contract.recording.reader import Progress, RecordingReader
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.part import Part
@@ -352,6 +353,11 @@ class _Content:
             events=np.array(self._events, dtype=np.int64)[first],
             event_copies=len(self._events) - len(first),
             recorded=recorded,
+            void={
+                key.removeprefix("void."): ranges_of(text)
+                for key, text in end.items()
+                if key.startswith("void.") and not self._kinds.isdisjoint({"resumed", GONE})
+            },
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
             excused=excused(self.topics, self.columns, self.said, self._external, steps) if self.is_paced else None,
         )

@@ -1,13 +1,19 @@
-"""The senders' own numbering, as far as it is still in the file, and what it says of messages that are not there."""
+"""The senders' own numbering, as far as it is still in the file, and what it says of messages that are not there.
+
+Numbers may be *void*: where a recorder was gone, and then whoever kept what it had not got. A coordinator that comes
+back gives out again, under new numbers, the modes that went so; the recorder says which numbers stand for nothing.
+"""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.contract.errors import counted
 from designer.replay.topics import Columns, Numbers, Topic
 
 Stored = NDArray[np.uint32]
@@ -19,7 +25,7 @@ _SHOWN = 5
 class Numbering(NamedTuple):
     """What the numbers say."""
 
-    notes: tuple[str, ...] = ()  # that they are not the senders'
+    notes: tuple[str, ...] = ()  # that they are not the senders', or stand for nothing
     faults: tuple[str, ...] = ()  # numbers that contradict each other
     is_exchanged: bool = True  # every number is there once: messages were exchanged, no number is a wrong one
     unseen: tuple[str, ...] = ()  # numbers that nobody has, between those that are there
@@ -30,12 +36,18 @@ class Numbering(NamedTuple):
 class _Sender:
     """One sender's numbers."""
 
-    def __init__(self, who: str, topics: list[tuple[str, Stored]], *, lacking: int, recorded: int) -> None:
+    def __init__(
+        self, who: str, topics: list[tuple[str, Stored]], *, lacking: int, recorded: int, void: Sequence[range]
+    ) -> None:
         """`topics` have their numbers in the order of the steps, of which `lacking` over all topics are not there;
         `recorded` messages were by the word of the recorder, 0 where that is not known."""
         self.who, self.topics, self.recorded = who, [topic for topic, _ in topics], recorded
-        self._lacking = lacking
-        falls = [(topic, numbers, np.flatnonzero(numbers[1:] <= numbers[:-1])) for topic, numbers in topics]
+        self._lacking, self._void = lacking, void
+        lost = min((numbers.start for numbers in void), default=np.inf)  # what was given again comes before this
+        falls = [
+            (topic, numbers, np.flatnonzero((numbers[1:] <= numbers[:-1]) & (numbers[1:] < lost)))
+            for topic, numbers in topics
+        ]
         self._falls = [
             f"{topic} has number {numbers[at[0] + 1]} after {numbers[at[0]]}, against the order of its steps"
             for topic, numbers, at in falls
@@ -56,7 +68,12 @@ class _Sender:
             return True
         if self.recorded:
             return int((self.numbers >= self.recorded).sum()) > most
-        return last + 1 - len(self.numbers) - self._lacking - events > max(most, self.total // 2)
+        return last + 1 - len(self.numbers) - self._lacking - events - self.void > max(most, self.total // 2)
+
+    @property
+    def void(self) -> int:
+        """How many numbers stand for nothing."""
+        return sum(len(numbers) for numbers in self._void)
 
     @property
     def repeats(self) -> bool:
@@ -76,6 +93,8 @@ class _Sender:
         there = self.numbers[self.numbers < total]
         is_there = np.zeros(total, dtype=bool)
         is_there[there] = True
+        for numbers in self._void:
+            is_there[numbers.start : numbers.stop] = True
         gaps = np.flatnonzero(~is_there)
         filled = [number for number in gaps.tolist() if events[number] > 0]
         events.subtract(filled)
@@ -93,9 +112,10 @@ def read_numbering(
     steps: int,
     events: Numbers,
     recorded: dict[str, int],
+    void: Mapping[str, Sequence[range]],
 ) -> Numbering:
     """`lacking` counts the steps below `steps` that each topic lacks, `events` are the numbers of the events."""
-    senders = _senders(topics, columns, lacking, steps, recorded)
+    senders = _senders(topics, columns, lacking, steps, recorded, void)
     total = sum(sender.total for sender in senders)
     if total > 1 and not any(sender.numbers.any() for sender in senders):
         note = "the senders' numbering is not in the file: every number is 0"
@@ -113,12 +133,17 @@ def _absent(senders: list[_Sender], steps: int, events: Numbers) -> int | None:
     """How many events are not there, by the recorder's word: what was recorded beside the steps. None: not known."""
     if not all(sender.recorded for sender in senders):
         return None
-    beside = sum(sender.recorded - steps * len(sender.topics) for sender in senders)
+    beside = sum(sender.recorded - sender.void - steps * len(sender.topics) for sender in senders)
     return max(0, beside - len(events))
 
 
 def _senders(
-    topics: list[Topic], columns: Columns, lacking: Counter[str], steps: int, recorded: dict[str, int]
+    topics: list[Topic],
+    columns: Columns,
+    lacking: Counter[str],
+    steps: int,
+    recorded: dict[str, int],
+    void: Mapping[str, Sequence[range]],
 ) -> list[_Sender]:
     found: defaultdict[str, list[Topic]] = defaultdict(list)
     for topic in topics:
@@ -131,6 +156,7 @@ def _senders(
             [(topic.topic, number[:steps, topic.place][has[:, topic.place]]) for topic in of_sender],
             lacking=sum(lacking[topic.topic] for topic in of_sender),
             recorded=recorded.get(who, 0),
+            void=void.get(who, ()),
         )
         for who, of_sender in sorted(found.items())
     ]
@@ -150,6 +176,11 @@ def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numberi
             first = ", ".join(map(str, numbers)) + (", ..." if count > _SHOWN else "")
             unseen.append(f"{count} more messages of {sender.who} are missing, by its numbers {first}")
     return Numbering(
+        notes=tuple(
+            f"{counted(sender.void, 'number')} of {sender.who} went with a process that was gone, or are of copies"
+            for sender in senders
+            if sender.void
+        ),
         faults=tuple(fault for sender in senders for fault in sender.faults()),
         is_exchanged=is_exchanged,
         unseen=tuple(unseen),

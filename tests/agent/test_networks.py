@@ -32,6 +32,7 @@ from agent.contract.errors import RunBroken
 from agent.contract.keys import COORDINATOR, MODE, PLANT, RECORDER, decode
 from agent.contract.messages import Acknowledged
 from agent.contract.recording.parts import files_of
+from agent.contract.recording.reader import RecordingReader
 from agent.filter import step
 from agent.network.bus import Bus
 from agent.network.words import Refused
@@ -453,3 +454,31 @@ def test_a_publisher_that_is_asked_to_go_waits_for_no_recorder_that_stays_away()
         first = processes(outcome, "node-n1")[0]
         assert re.fullmatch(r"terminated; the recorder has not got \d+ messages of ours", str(first.error))
         assert broken(outcome) == []
+
+
+def _void(outcome: Outcome) -> str:
+    """The coordinator's numbers that stand for nothing, as the recording has them."""
+    with RecordingReader(outcome.recording) as reader:
+        for _ in reader.messages():
+            pass
+        return (reader.end or {}).get(f"void.{COORDINATOR}", "")
+
+
+def test_modes_that_went_with_a_coordinator_are_not_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recorder that has just come back has not asked it yet; its successor gives them out under other numbers."""
+    both = asked(faults=(f"kill:{COORDINATOR},step=14", f"kill:{RECORDER},step=6"))
+    slow = replace(both, weather=Weather(delay=0.005, reaction=0.02), plan=replace(both.plan, pace=Pace(0.05)))
+    for seed in range(100):
+        with simulated(replace(slow, seed=seed)) as outcome:
+            if not _void(outcome):
+                continue
+            assert outcome.summary is not None
+            lost = [each for each in outcome.unrecorded if each.sent.topic != MODE]
+            assert outcome.summary.missing <= len(lost) < len(outcome.unrecorded)
+            verdict = replay(outcome.recording)
+            assert verdict.agrees, verdict.text()
+            assert any("went with a process that was gone" in note for note in verdict.notes)
+            monkeypatch.setattr("designer.replay.log.ranges_of", lambda text: [])
+            assert not replay(outcome.recording).agrees
+            return
+    pytest.fail("no coordinator was killed before it was asked")

@@ -136,3 +136,32 @@ def test_events_complete_no_step() -> None:
     receipts = filled([("event", 0, Stamp(number, 0, "coordinator")) for number in range(10)])
     assert receipts.complete == 0
     assert receipts.messages == 10
+
+
+def test_modes_that_are_given_again_are_not_missing() -> None:
+    """They come under new numbers; one that was there after all is a copy, and its number stands for nothing."""
+
+    def mode(number: int, step: int) -> bool:
+        return receipts.take("mode", step, Stamp(number, 0, "coordinator"))
+
+    receipts = Receipts(PROBLEM, paced=True)
+    for number in (0, 1, 4):
+        assert mode(number, number)
+    receipts.close_gap("coordinator")
+    assert (receipts.missing("coordinator"), receipts.void["coordinator"]) == (2, {2, 3})
+    assert receipts.received["coordinator"] == 5
+    for number, step in ((5, 2), (6, 3), (7, 4), (8, 5)):
+        assert mode(number, step)
+    assert (receipts.missing("coordinator"), receipts.void["coordinator"]) == (0, {2, 3, 7})
+    assert receipts.complete == 6
+
+
+def test_a_gap_that_is_closed_counts_once() -> None:
+    receipts = Receipts(PROBLEM, paced=True)
+    for number in (0, 2):
+        receipts.take("event", 0, Stamp(number, 0, "node-n0"))
+    receipts.close_gap("node-n0")
+    receipts.take("event", 0, Stamp(5, 0, "node-n0"))
+    receipts.close_gap("node-n0")
+    assert receipts.missing("node-n0") == 3
+    assert receipts.void["node-n0"] == {1, 3, 4}
