@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 GLANCE = 0.1  # seconds between looks at the sensors while the run is waited for
 GRACE = 5.0  # seconds for a run to end well after a sensor has failed: it may have failed at what ends last
+LAST_LOOK = 1.0  # seconds for each sensor to end, after a run that did not end well
 FAREWELL = 60.0  # seconds for a run to end in order, before it is killed
 
 
@@ -53,6 +54,7 @@ class Mesh:
         sensors = sensors or {}
         for node in sensors:
             self.gains.problem.node_index(node)
+        self.was_awaited = False  # whether somebody has asked how it ends
         self._verdict: Verdict | None = None
         self._sensors: dict[str, sensing.Sensor] = {}
         with ExitStack() as stack:
@@ -69,7 +71,7 @@ class Mesh:
 
     def wait(self) -> None:
         """Until the run is over. Raises RunBroken where it has not come to its end, or a sensor has failed before."""
-        failures = ""
+        self.was_awaited, failures = True, ""
         while self._process.poll() is None and not failures:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(GLANCE)
@@ -78,7 +80,7 @@ class Mesh:
             self._process.wait(GRACE)
         if self._process.returncode == EXIT_GOOD:
             return
-        error, failures = self._error(), self._failures()
+        error, failures = self._error(), self._failures(LAST_LOOK)
         self._end()
         raise RunBroken(failures) if failures else error
 
@@ -120,8 +122,8 @@ class Mesh:
             raise self._error()
         return str(json.loads(line)["listening"][0])
 
-    def _failures(self) -> str:
-        failures = {node: sensor.failure() for node, sensor in self._sensors.items()}
+    def _failures(self, seconds: float = 0.0) -> str:
+        failures = {node: sensor.failure(seconds) for node, sensor in self._sensors.items()}
         return "; ".join(f'the sensor of node "{node}" failed: {why}' for node, why in failures.items() if why)
 
     def _error(self) -> InputError | RunBroken:

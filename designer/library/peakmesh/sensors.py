@@ -11,11 +11,13 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from queue import SimpleQueue
 from typing import Any, Protocol
 
 import zenoh
 
+from agent.contract.errors import InputError
 from agent.contract.keys import COORDINATOR, MODE, RECORDER, alive, key, measurement, node_who, sensor_who
 
 PATIENCE = 60.0  # seconds for a function to return, which nobody can end
@@ -27,8 +29,8 @@ Source = Measure | str | Sequence[str]  # or a command, in which {run}, {node} a
 class Sensor(Protocol):
     """Measures one node of a run."""
 
-    def failure(self) -> str | None:
-        """Why it measures no more; None while it does, and where it has ended well."""
+    def failure(self, seconds: float = 0.0) -> str | None:
+        """Why it measures no more; None where it has not ended within so many seconds, or has ended well."""
 
     def close(self) -> None:
         """End it, if it has not ended."""
@@ -51,13 +53,14 @@ class _Command:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._said, start_new_session=True
             )
-        except OSError:
+        except OSError as error:
             self._said.close()
-            raise
+            raise InputError(f'a sensor, "{words[0]}", cannot be started: {error.strerror}') from None
 
-    def failure(self) -> str | None:
-        code = self._process.poll()
-        if not code:
+    def failure(self, seconds: float = 0.0) -> str | None:
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+        if not (code := self._process.returncode):
             return None
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
@@ -78,7 +81,7 @@ class _Function:
         self._thread = threading.Thread(target=self._serve, name=sensor_who(node), daemon=True)
         self._thread.start()
 
-    def failure(self) -> str | None:
+    def failure(self, seconds: float = 0.0) -> str | None:
         return None if self._error is None else f"{type(self._error).__name__}: {self._error}"
 
     def close(self) -> None:
@@ -128,5 +131,9 @@ class _Function:
         topic = key(self._run, measurement(self._node))
         while (mode := self._modes.get()) is not None:
             step = json.loads(mode)["step"]
-            y = [float(entry) for entry in self._measure(step)]
+            try:
+                y = [float(entry) for entry in self._measure(step)]
+            except Exception as error:  # noted while we still are there: then the run ends
+                self._error = error
+                return
             session.put(topic, json.dumps({"step": step, "y": y}), congestion_control=zenoh.CongestionControl.BLOCK)

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 def mesh(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..., Mesh]]:
     """Starts a network for this test, on free ports: `mesh(gains, ...)` takes what `peakmesh.Mesh` does.
 
-    Its `verdict()` waits for the end and fails the test where the replay does not agree; where the test has not asked
-    for it, it is asked for at the end. Whatever happens, everything that was started is ended. The recording stays in
-    the folder of the test.
+    Its `verdict()` waits for the end and fails the test where the replay does not agree; where the test has not waited
+    for it, that is done at the end. Whatever happens, everything that was started is ended. The recording stays in the
+    folder of the test.
     """
     from peakmesh import Mesh
 
@@ -42,4 +42,5 @@ def mesh(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[..
         yield start
         if request.session.testsfailed == failed:
             for each in meshes:
-                each.verdict()
+                if not each.was_awaited:
+                    each.verdict()
