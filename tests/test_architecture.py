@@ -91,7 +91,7 @@ ROOMS = {
     "peakmesh.sensors": "",
     "peakmesh.mesh": "designer.replay peakmesh.answers peakmesh.running peakmesh.sensors",
     "peakmesh": "peakmesh.answers peakmesh.mesh peakmesh.running",
-    "peakmesh.background": "peakmesh peakmesh.running",
+    "peakmesh.background": "agent.commands peakmesh peakmesh.running",
     "peakmesh.testing": "peakmesh peakmesh.mesh",
 }
 LIBRARY = "designer/library/"  # what is in it is imported without that, so that no other folder's modules are

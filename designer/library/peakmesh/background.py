@@ -20,7 +20,8 @@ def main() -> int:
     """Returns the exit code of `peakmesh run`."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     claim()
-    from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, PeakmeshError
+    from agent.commands.run import exit_code_of
+    from agent.contract.errors import PeakmeshError
     from peakmesh.running import run
 
     try:
@@ -28,9 +29,9 @@ def main() -> int:
     except PeakmeshError as error:
         print(error, file=sys.stderr, flush=True)
         return error.exit_code
-    if done.broken_off:
-        print(f"the recording broke off: {done.broken_off}", file=sys.stderr, flush=True)
-    return EXIT_BROKEN if done.broken_off else EXIT_GOOD
+    if why := done.broken_off or done.not_whole:
+        print(f"the recording is not whole: {why}", file=sys.stderr, flush=True)
+    return exit_code_of(vars(done))
 
 
 def _tell(word: dict[str, Any]) -> None:

@@ -38,7 +38,9 @@ class Run:
     broken_off: str  # why there is no whole recording; "" where there is one
     start_seconds: float  # until step 0
     rounds_per_second: float
+    not_whole: str = ""  # who is not recorded to its last step, in a paced run
     pacing: dict[str, Any] | None = None  # of a paced run
+    refused: dict[str, Any] | None = None  # messages that did not fit
 
     def replay(self) -> Verdict:
         """The recording against the centralised error model."""
