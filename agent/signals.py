@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable
 from types import FrameType
 from typing import Any
@@ -19,7 +20,12 @@ Handlers = dict[int, Any]  # of signals; what signal.signal returns
 
 
 def heed(handler: Handler) -> Handlers:
-    """Have `handler` called when this program is asked to end; returns what was there before, for `restore`."""
+    """Have `handler` called when this program is asked to end; returns what was there before, for `restore`.
+
+    In a thread that is not the main one nothing is: signals are the main thread's.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
     terminal = [stream for stream in (1, 2) if os.isatty(stream)]
 
     def asked_to_end(number: int, frame: FrameType | None) -> None:

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from agent.contract.arrays import Array, Model
 from agent.contract.errors import InputError, first_fault
 from agent.contract.files import read_bytes, read_json
+from agent.contract.frozen import plain
 from agent.contract.gains import FORMAT, Gains, LinkMatrices, Solver, check_links
 from agent.contract.problem import Problem
 from designer import stacked
@@ -178,11 +179,22 @@ def load_given(path: Path, problem: Problem) -> GivenGains:
     else:
         file = Gains.from_bytes(data, source=str(path))
         K, H = file.K, file.H
+    return given(problem, K, H, source=str(path), file=file)
+
+
+def given_plain(problem: Problem, K: Any, H: Any) -> GivenGains:
+    """Gains that Python has, as maps by mode, receiver and sender, of arrays or lists. Raises InputError."""
+    plain_gains = _Plain.from_document(plain({"K": K, "H": H}))
+    return given(problem, plain_gains.K, plain_gains.H, source="what is given", file=None)
+
+
+def given(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, source: str, file: Gains | None) -> GivenGains:
+    """Gains for the links of `problem`; InputError where they are for others."""
     try:
         check_links(problem, K, H)
     except ValueError as error:
-        raise InputError(f"{path} does not fit {problem.name}: {error}") from None
-    return GivenGains(K, H, str(path), file)
+        raise InputError(f"{source} does not fit {problem.name}: {error}") from None
+    return GivenGains(K, H, source, file)
 
 
 def _unstacked(document: dict[str, Any], problem: Problem, path: Path) -> dict[str, Any]:

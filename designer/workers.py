@@ -12,7 +12,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
@@ -55,7 +55,8 @@ def greet_cluster(address: str) -> None:
             "a Dask cluster needs the package distributed, which is not installed; pip install 'peakmesh[dask]'"
         ) from None
     try:
-        asyncio.run(_greet(address))
+        with ThreadPoolExecutor(1) as thread:  # this one may have an event loop already, as notebooks do
+            thread.submit(asyncio.run, _greet(address)).result()
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         raise _nobody(address, error) from None
 
@@ -72,7 +73,10 @@ def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], num
         while futures:
             yield futures.popleft().result()
     except BrokenProcessPool:
-        raise RunBroken("a worker process died; was there too little memory? --processes asks for fewer") from None
+        raise RunBroken(
+            "a worker process died; was there too little memory? --processes asks for fewer. In a script of your own, "
+            'is what it does under if __name__ == "__main__": ?'
+        ) from None
     finally:
         for worker in set(multiprocessing.active_children()) - others:
             worker.terminate()  # it is idle, or at a job whose result nobody waits for any more

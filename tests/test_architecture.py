@@ -84,11 +84,22 @@ ROOMS = {
     "designer.stacked designer.sweep designer.synthesis designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
+    # the library, whose source stands in designer/library/
+    "peakmesh.answers": "designer.analysis designer.problems designer.proof designer.replay designer.report "
+    "designer.search designer.simulation designer.synthesis",
+    "peakmesh.running": "agent.commands agent.contract.recording agent.launch agent.plan designer.replay "
+    "peakmesh.answers",
+    "peakmesh.sensors": "",
+    "peakmesh.mesh": "designer.replay peakmesh.answers peakmesh.running peakmesh.sensors",
+    "peakmesh": "peakmesh.answers peakmesh.mesh peakmesh.running",
+    "peakmesh.background": "agent.commands peakmesh peakmesh.running",
+    "peakmesh.testing": "peakmesh peakmesh.mesh",
 }
+LIBRARY = "designer/library/"  # what is in it is imported without that, so that no other folder's modules are
 
 # Each outside thing behind as few doors as can be.
 DOORS = {
-    "zenoh": ["agent/network/session.py"],
+    "zenoh": ["agent/network/session.py", "designer/library/peakmesh/sensors.py"],
     "cryptography": ["agent/authority.py"],
     "foxglove": ["agent/roles/viewer.py"],
     "mcap": ["agent/contract/recording/"],
@@ -108,7 +119,7 @@ DOORS = {
     ],
     "pyarrow": ["designer/export/tables.py"],
     "flint": ["designer/proof/"],
-    "matplotlib": ["designer/report/"],
+    "matplotlib": ["designer/report/", "designer/library/peakmesh/answers.py"],  # there for the type checker
     "setproctitle": ["agent/nursery.py"],
     "rich": ["agent/commands/words.py", "designer/commands/", "designer/watch/table.py"],
     "distributed": ["designer/workers.py"],
@@ -140,7 +151,7 @@ IMPURE = [
 # Command lines answer at once: before a command is called they import the standard library and these alone.
 LAZY = [
     "agent/cli.py", "agent/commands/", "agent/__main__.py", "designer/cli.py", "designer/commands/",
-    "designer/__main__.py",
+    "designer/__main__.py", "designer/library/peakmesh/__init__.py",
 ]  # fmt: skip
 LIGHT = [
     "agent.cli", "agent.commands", "agent.plan", "agent.signals", "agent.contract.errors", "agent.contract.files",
@@ -186,7 +197,7 @@ def room_of(name: str) -> str | None:
 
 
 def module_of(path: str) -> str:
-    return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return path.removeprefix(LIBRARY).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
 def forbidden(path: str, name: str) -> bool:
@@ -321,6 +332,9 @@ def loaded(modules: str) -> set[str]:
          "agent.filter agent.inbox agent.roles agent.network.bus zenoh cvxpy clarabel scipy flint matplotlib"),
         # a page of a report: no figures for papers
         ("designer.report.page", "agent.filter agent.network zenoh cvxpy clarabel scipy flint matplotlib"),
+        # the library, and its plugin for pytest, before anything of them is used
+        ("peakmesh", "agent designer pydantic numpy zenoh mcap cvxpy scipy matplotlib"),
+        ("peakmesh.testing", "agent designer pydantic numpy zenoh mcap cvxpy scipy matplotlib"),
         # a worker, before its first job: what sets the number of its threads comes before numpy
         ("designer.workers", "numpy distributed"),
         # the certificate: no solver

@@ -50,7 +50,7 @@ class Frozen(BaseModel):
         fields, changes = type(self).model_fields, update or {}
         if unknown := changes.keys() - fields.keys():
             raise InputError(f"{type(self).__name__} has no field {listed(sorted(unknown))}; it has {listed(fields)}")
-        changed = {fields[name].alias or name: _plain(value) for name, value in changes.items()}
+        changed = {fields[name].alias or name: plain(value) for name, value in changes.items()}
         return self.from_document(self.document() | changed)
 
     def __copy__(self) -> Self:
@@ -78,15 +78,15 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(part)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value of a field as it stands in a document."""
     match value:
         case Frozen():
             return value.document()
-        case np.ndarray():
+        case np.ndarray() | np.generic():
             return value.tolist()
         case list() | tuple():
-            return [_plain(entry) for entry in value]
+            return [plain(entry) for entry in value]
         case dict():
-            return {key: _plain(entry) for key, entry in value.items()}
+            return {key: plain(entry) for key, entry in value.items()}
     return value

@@ -12,6 +12,7 @@ from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
 from agent.contract.errors import InputError, listed
 from agent.contract.files import kind_of, read_bytes, read_json, write_whole
 from agent.contract.problem import Problem
+from agent.contract.tables import table
 
 FORMAT = "peakmesh-gains"
 VERSION = 1
@@ -88,9 +89,9 @@ class Gains(Model):
     worst_case: Matrix | None = None  # (steps, nw), energy 1: the worst fixed w, where the problem asks for it
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls, path: str | Path) -> Self:
         """Read a gains.json. Raises InputError for a file that is missing, cut, foreign or edited."""
-        return cls.from_bytes(read_bytes(path, kind="gains file"), source=str(path))
+        return cls.from_bytes(read_bytes(Path(path), kind="gains file"), source=str(path))
 
     @classmethod
     def from_bytes(cls, data: bytes, *, source: str) -> Self:
@@ -114,9 +115,28 @@ class Gains(Model):
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
 
-    def save(self, path: Path, *, force: bool = False) -> None:
+    @property
+    def gamma(self) -> float:
+        """What the certificate claims."""
+        return self.certificate.gamma
+
+    def __repr__(self) -> str:
+        """In a line; `document()` has everything."""
+        claim = "certified" if self.certificate.holds else "not certified"
+        return f"Gains({self.problem.name} by {self.method}: gamma = {self.gamma:.6g}, {claim})"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        claim = self.certificate
+        exact = "" if claim.exact is None else f"between {claim.exact[0]} and {claim.exact[1]}"
+        facts = {"method": self.method, "gamma": str(self.gamma), "exact gain": exact, "verified": claim.verified}
+        return table(repr(self), ((name, value) for name, value in facts.items() if value))
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write canonical JSON, whole or not at all."""
-        write_whole(path, self.canonical(), force=force)
+        write_whole(Path(path), self.canonical(), force=force)
 
     def for_node(self, name: str) -> NodeGains:
         """What node `name` needs to run."""

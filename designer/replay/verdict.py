@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 from agent.contract.arrays import ulps
@@ -241,7 +242,16 @@ class Verdict:
             "proofs": [vars(proof) for proof in self.proofs],
         }
 
+    def __repr__(self) -> str:
+        """In a line; `text()` and `document()` have everything."""
+        return f"Verdict({self.recording}: {self.headline()})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return f"<pre>{escape(self.text())}</pre>"
+
     def text(self) -> str:
+        """The facts for people."""
         if not self.compared:
             return "\n".join(self._head())
         pacing = self.pacing.text() if self.pacing is not None else []

@@ -3,24 +3,26 @@
 Not in the paper: losses that a node sees, links that lose messages, gains that are imposed to be unbiased.
 
 `parts` and `disturbance` are what a problem is made of, each checked by itself; `consistency` is what must hold
-between them; `file` is how it is written down.
+between them; `file` is how it is written down, `changes` how Python says it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field, field_validator, model_validator
 
 from agent.contract.arrays import Array, Model, read_only
-from agent.contract.errors import InputError, listed
-from agent.contract.problem import consistency, file
+from agent.contract.errors import InputError, counted, listed
+from agent.contract.problem import changes, consistency, file
 from agent.contract.problem.disturbance import Disturbance, Quiet
 from agent.contract.problem.parts import LossyLink, MarkovChain, Name, Node, Plant, Topology
+from agent.contract.tables import table
 
 
 class Problem(Model):
@@ -36,11 +38,12 @@ class Problem(Model):
     unbiased: bool | None = Field(default=None, strict=True)  # sum over j of a_ij K_ij = A, imposed; None: it is not
 
     @classmethod
-    def load(cls, path: Path, revise: Callable[[dict[str, Any]], None] | None = None) -> Self:
+    def load(cls, path: str | Path, revise: Callable[[dict[str, Any]], None] | None = None) -> Self:
         """Read a problem.toml; `revise` may change what it says before it is checked.
 
         Raises InputError: one sentence naming the place, the value, what is right.
         """
+        path = Path(path)
         document = file.read_toml(path)
         if revise is not None:
             revise(document)
@@ -49,6 +52,70 @@ class Problem(Model):
             return cls.from_document(document)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        name: str,
+        *,
+        A: ArrayLike,
+        B: ArrayLike,
+        M: ArrayLike,
+        C: Mapping[str, ArrayLike],
+        D: Mapping[str, ArrayLike],
+        adjacency: Mapping[str, ArrayLike],
+        transition: ArrayLike = ((1.0,),),
+        initial: str | None = None,
+        arrival_probability: float | Mapping[str, float] = 1.0,
+        **others: Any,
+    ) -> Self:
+        """A problem of arrays. `C` and `D` have one for each node, by its name, `adjacency` one for each mode.
+
+        A: (nx, nx), B: (nx, nw), M: (nz, nx), C_i: (ny_i, nx), D_i: (ny_i, nw), adjacency: (n, n) with the rows who
+        hears, transition: (modes, modes). `initial` is the first mode where it is not given; `others` are further keys
+        of a problem file, such as `disturbance`. Raises InputError as `load` does.
+        """
+        document = changes.from_arrays(
+            name,
+            A=A,
+            B=B,
+            M=M,
+            C=C,
+            D=D,
+            adjacency=adjacency,
+            transition=transition,
+            initial=initial,
+            arrival_probability=arrival_probability,
+            others=others,
+        )
+        return cls.from_document(document)
+
+    def with_(self, **values: Any) -> Self:
+        """A copy with other values, under the names of a problem file; it is validated like a file.
+
+        Tables are changed key by key, nodes and topologies by their names, all of them by "*":
+        `problem.with_(plant={"A": A}, node={"*": {"arrival_probability": 0.7}})`. A `disturbance` is replaced.
+        Raises InputError: one sentence for what cannot be.
+        """
+        return self.from_document(changes.changed(self.document(), values))
+
+    def __repr__(self) -> str:
+        """In a line; `document()` has everything."""
+        parts = (counted(self.n, "node"), counted(self.nx, "state"), counted(len(self.topologies), "mode"))
+        return f"Problem({self.name}: {', '.join(parts)})"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: each node, and whom it hears in each mode."""
+        rows = []
+        for i, node in enumerate(self.nodes):
+            heard = (
+                f"{mode}: {', '.join(self.node_names[j] for j in self.neighbours(s, i) if j != i) or 'nobody'}"
+                for s, mode in enumerate(self.mode_names)
+            )
+            rows.append((node.name, f"arrives with {node.arrival_probability:g}; hears in mode {'; '.join(heard)}"))
+        return table(repr(self), rows)
 
     @model_validator(mode="before")
     @classmethod
