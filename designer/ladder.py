@@ -6,8 +6,12 @@ have: that is how loose the bound is. What lies below both is what better gains 
 
 from __future__ import annotations
 
+import csv
 import math
+import re
+from collections.abc import Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal, localcontext
+from io import StringIO
 from typing import Any, NamedTuple
 
 from agent.contract.gains import Gains
@@ -62,6 +66,12 @@ class Ladder(NamedTuple):
         ]
         return [(name, value) for name, value in rungs if value is not None]
 
+    def table(self, problem: str, kind: str) -> str:
+        """The rungs as `as_table` writes them, under the name of the problem."""
+        return as_table(
+            ["", problem], [(name, [value], [rung_text(name, value)]) for name, value in self.rungs()], kind
+        )
+
     def lines(self) -> list[str]:
         """A line for each rung, the lowest first."""
         remarks = []
@@ -76,6 +86,34 @@ class Ladder(NamedTuple):
         if self.exact is None and self.gamma is not None:
             lines.append(f"{'-':{width}}  {EXACT}: not computed for so large a network; analyse does")
         return lines
+
+
+def as_table(head: Sequence[str], rows: Sequence[tuple[str, Sequence[float | None], Sequence[str]]], kind: str) -> str:
+    """Rows of a name, numbers, and the same as people read them: "csv" takes the numbers, "latex" what is read.
+
+    LaTeX is a tabular with the rules of booktabs.
+    """
+    if kind == "csv":
+        text = StringIO()
+        csv.writer(text, lineterminator="\n").writerows([head, *([name, *numbers] for name, numbers, _ in rows)])
+        return text.getvalue()
+    lines = [" & ".join(map(_in_latex, [name, *shown])) + r" \\" for name, _, shown in rows]
+    return "\n".join(
+        [
+            rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
+            r"\toprule",
+            " & ".join(map(_in_latex, head)) + r" \\",
+            r"\midrule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}",
+            "",
+        ]
+    )
+
+
+def _in_latex(text: str) -> str:
+    return re.sub(r"([&%$#_{}])", r"\\\1", text)
 
 
 def rung_text(name: str, value: float) -> str:

@@ -13,7 +13,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
-from designer.ladder import rounded_up
+from designer.ladder import as_table, rounded_up
 from designer.model.error_model import StackedGains, error_model
 from designer.problems import find
 from designer.search.starts import consensus_gains, least_variance_gains
@@ -119,6 +119,15 @@ class Reproduced(NamedTuple):
                 cells = (self.cell(self.values[name][row.key], row.key) for name in names)
                 lines.append(f"{row.text:{width}}" + "".join(f"  {cell:>14}" for cell in cells))
         return "\n".join([*lines, "", *self.remarks()])
+
+    def table(self, kind: str) -> str:
+        """The table as `designer.ladder.as_table` writes it, without remarks."""
+        rows = []
+        for row in ROWS:
+            values = [self.values[name].get(row.key) for name in self.values]
+            if row.key in next(iter(self.values.values())):
+                rows.append((row.text, values, [self.cell(value, row.key) for value in values]))
+        return as_table(["", *self.values], rows, kind)
 
     @staticmethod
     def cell(value: float | None, key: str) -> str:

@@ -33,6 +33,17 @@ def add_set(parser: argparse.ArgumentParser, *, also: str = "") -> None:
     )
 
 
+def add_table(parser: argparse.ArgumentParser, about: str) -> None:
+    """Add --table; `refuse_both` holds it against --json."""
+    parser.add_argument("--table", choices=("csv", "latex"), help=f"print {about} as a table alone")
+
+
+def refuse_both(options: argparse.Namespace) -> None:
+    """InputError where two forms of the same are asked for."""
+    if options.table and options.json:
+        raise InputError("--table and --json print the same in two forms; leave one of them out")
+
+
 def find_to_design(text: str, settings: Sequence[str] = ()) -> Problem:
     """The problem that `text` names, which has something to estimate. InputError, with that name in it, otherwise."""
     from designer.diagnosis import refuse_nothing_to_estimate

@@ -9,7 +9,7 @@ from pathlib import Path
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, add_set, find_to_design, tell_notes
+from designer.commands import PROBLEM, add_set, add_table, find_to_design, refuse_both, tell_notes
 from designer.commands.within import add_within
 
 
@@ -42,6 +42,7 @@ def add_analyse(commands: Subcommands) -> None:
         "--radius", action="store_true", help="the largest such boxes for which 1.05 gamma is proved; takes its time"
     )
     analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
+    add_table(analyse, "the ladder")
     analyse.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -51,6 +52,7 @@ def analyse_command(options: argparse.Namespace) -> int:
     from designer.box.extent import box_of, within
     from designer.ladder import rounded_up
 
+    refuse_both(options)
     problem = find_to_design(options.problem, options.settings)
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
@@ -69,5 +71,8 @@ def analyse_command(options: argparse.Namespace) -> int:
         rows = ranked(problem, given, options.against)
         facts["against"] = [row.document() for row in rows]
         text += f"\n\n{table(rows)}"
-    print(json.dumps(facts) if options.json else text)
+    if options.table:
+        print(analysis.ladder.table(problem.name, options.table), end="")
+    else:
+        print(json.dumps(facts) if options.json else text)
     return EXIT_GOOD if analysis.stable else EXIT_NO

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
-from designer.commands import PROBLEM, add_set, find_to_design, tell_notes
+from designer.commands import PROBLEM, add_set, add_table, find_to_design, refuse_both, tell_notes
 from designer.commands.stopping import stoppable
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def add_design(commands: Subcommands) -> None:
         help="the designs of --price, or the windows of more than 200 nodes, run on this Dask cluster",
     )
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
+    add_table(design, "the ladder")
     design.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -82,15 +83,20 @@ def duration(text: str) -> float:
 
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
+    from designer.ladder import ladder_of
 
+    refuse_both(options)
     problem = find_to_design(options.problem, options.settings)
     problem = _what_is_left(problem, options.without_node, options.without_link)
     if options.price:
         return _price_command(problem, options)
-    _, result = design_and_save(
+    gains, result = design_and_save(
         problem, options.method, options.output, force=options.force, budget=options.budget, dask=options.dask
     )
-    print(json.dumps(result) if options.json else design_text(result))
+    if options.table:
+        print(ladder_of(gains).table(problem.name, options.table), end="")
+    else:
+        print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
 
 
@@ -232,6 +238,8 @@ def _price_command(problem: Problem, options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM --price`."""
     from designer.what_if import price, price_method, price_text
 
+    if options.table:
+        raise InputError("--table prints the ladder of one design; --price has a table of its own, and --json")
     if options.budget is not None:
         raise InputError("--budget is for one design; --price goes to the end of each search, that all compare")
     if options.output is not None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 from decimal import Decimal
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from benchmarks.design import banded
+from designer.cli import main
 from designer.ladder import Ladder, ladder_of, percent, rounded_up
 from designer.problems import find, names
 from designer.search.effort import (
@@ -169,3 +172,35 @@ def test_windows_need_less_memory_than_a_search_of_all_at_once() -> None:
 
 def test_seconds_in_words() -> None:
     assert [in_words(s) for s in (0.1, 40.0, 700.0, 7300.0)] == ["2 seconds", "40 seconds", "12 minutes", "2 hours"]
+
+
+def test_a_table_for_a_paper_has_every_rung() -> None:
+    """In CSV the numbers bit for bit, in LaTeX as they are read, and what LaTeX would take for its own escaped."""
+    ladder = Ladder(0.0, (0.1, 0.123456789), 0.2, None, 1 / 3)
+    rows = list(csv.reader(ladder.table("my_net", "csv").splitlines()))
+    assert rows[0] == ["", "my_net"]
+    assert [(name, float(value)) for name, value in rows[1:]] == ladder.rungs()
+    lines = ladder.table("my_net", "latex").splitlines()
+    assert lines[:4] == [r"\begin{tabular}{lr}", r"\toprule", r" & my\_net \\", r"\midrule"]
+    assert lines[4:-2] == [
+        r"floor & 0.000000 \\",
+        r"exact gain of these gains & 0.123457 \\",
+        r"gamma, certified & 0.200000 \\",
+        r"Theorem 2's bound & 0.333334 \\",
+    ]
+    assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]
+
+
+@pytest.mark.parametrize("command", ["design", "analyse"])
+def test_commands_print_it_alone(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["design", "two-nodes", "-o", "g.json", "--method", "decomposed"]) == 0
+    words = {"design": ["--method", "decomposed", "-o", "new.json"], "analyse": ["--gains", "g.json"]}[command]
+    capsys.readouterr()
+    assert main([command, "two-nodes", *words, "--table", "csv"]) == 0
+    rows = list(csv.reader(capsys.readouterr().out.splitlines()))
+    assert (rows[0], rows[1][0]) == (["", "two-nodes"], "floor")
+    assert main([command, "two-nodes", *words, "--force", "--table", "csv", "--json"]) == 2
+    assert "leave one of them out" in capsys.readouterr().err

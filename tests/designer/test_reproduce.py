@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+
 import pytest
 
 from designer.ladder import rounded_up
@@ -40,6 +42,21 @@ def test_what_is_said_of_the_printed_values(paper: Reproduced) -> None:
     assert "cannot come from (42)" in first
     assert f"{value(paper, EXAMPLES[0], 'theorem2_exact'):.4f}" in reached
     assert f"{100.0 * above:.1f} % above the optimum" in second
+
+
+def test_its_table_for_a_paper_is_the_one_that_is_printed() -> None:
+    """In CSV every number bit for bit, and nothing where there is none; in LaTeX the cells of the text."""
+    values = {
+        "zhu2020-ideal": {"printed": 0.23, "consensus": None},
+        "zhu2020-lossy": {"printed": 0.36, "consensus": 1 / 3},
+    }
+    table = Reproduced(values, {})
+    head, *rows = csv.reader(table.table("csv").splitlines())
+    assert head == ["", "zhu2020-ideal", "zhu2020-lossy"]
+    assert [row[1:] for row in rows] == [["0.23", "0.36"], ["", repr(1 / 3)]]
+    shown = [line.removesuffix(r" \\").split(" & ")[1:] for line in table.table("latex").splitlines() if " & " in line]
+    assert shown == [["zhu2020-ideal", "zhu2020-lossy"], ["0.23", "0.36"], ["not stable", "0.333333"]]
+    assert all(cell in table.text() for row in shown for cell in row)
 
 
 def test_every_row() -> None:
