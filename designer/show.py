@@ -13,6 +13,7 @@ from agent.contract.gains import Gains
 from agent.contract.keys import EVIDENCE
 from agent.contract.layout import foxglove_layout
 from agent.contract.problem import Problem
+from agent.contract.problem.parts import Plant
 from agent.contract.recording.contents import number
 from agent.contract.recording.reader import Progress, RecordingReader
 from agent.contract.recording.source import Source
@@ -148,6 +149,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "states": problem.nx,
         "disturbances": problem.nw,
         "outputs": problem.nz,
+        **_sampled(problem.plant),
         "measurements": sum(len(node.C) for node in problem.nodes),
         "arrival_probability": problem.beta.tolist(),
         "sees_its_losses": [node.name for node in problem.nodes if node.seen],
@@ -157,6 +159,16 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "notes": notes(problem),
         "digest": problem.digest(),
     }
+
+
+def _sampled(plant: Plant) -> dict[str, Any]:
+    """What is known of a plant of continuous time; nothing of another."""
+    if plant.sample_time is None:
+        return {}
+    how = (
+        "A = exp(A_continuous T), B = integral of exp(A_continuous t) B_continuous from 0 to T, w held between samples"
+    )
+    return {"sample_time": plant.sample_time, "discretised": f"{how}; A = {plant.A.tolist()}, B = {plant.B.tolist()}"}
 
 
 def _gains(gains: Gains) -> dict[str, Any]:

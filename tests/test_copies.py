@@ -27,6 +27,7 @@ from agent.contract.frozen import Frozen
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
+from agent.contract.problem.parts import Continuous
 from designer import analysis, problems
 from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
 from designer.replay.central import Central
@@ -90,6 +91,7 @@ def examples() -> dict[type, Frozen]:
         gains,
         analysis._Plain(K=gains.K, H=gains.H),
         LOSSY,
+        Continuous(A_continuous=np.zeros((1, 1)), B_continuous=np.ones((1, 1)), sample_time=0.5),
         DampedSine(kind="damped-sine", decay=0.2),
         Impulse(kind="impulse"),
         White(kind="white", deviation=1.0),

@@ -10,6 +10,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from agent.contract.problem.parts import CONTINUOUS
 from designer.model.error_model import ErrorModel
 
 _DOUBLINGS = 20  # 2^20 terms of the sum of A^k B B' A'^k
@@ -107,7 +108,12 @@ def rescaled(problem: Problem, units: Units) -> Problem:
     """The same problem in the given units; w and y keep theirs."""
     plant, columns, rows = problem.plant, units.state, units.state[:, None]
     scaled = plant.model_copy(
-        update={"A": plant.A * columns / rows, "B": plant.B / rows, "M": plant.M * columns / units.output}
+        update={
+            **dict.fromkeys(CONTINUOUS),
+            "A": plant.A * columns / rows,
+            "B": plant.B / rows,
+            "M": plant.M * columns / units.output,
+        }
     )
     nodes = tuple(node.model_copy(update={"C": node.C * columns}) for node in problem.nodes)
     return problem.model_copy(update={"plant": scaled, "nodes": nodes})

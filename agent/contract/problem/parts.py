@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from agent.contract.arrays import Matrix, Model, Number, shape_text
-from agent.contract.errors import counted, shortened
+from agent.contract.errors import counted, first_fault, listed, shortened
+from agent.contract.problem.sampling import sampled
 
 
 def _legal_name(name: str) -> str:
@@ -21,12 +22,62 @@ def _legal_name(name: str) -> str:
 Name = Annotated[str, AfterValidator(_legal_name)]
 
 
+class Continuous(Model):
+    """dx/dt = A_continuous x + B_continuous w, of which a sample is taken every `sample_time`."""
+
+    A_continuous: Matrix
+    B_continuous: Matrix
+    sample_time: Number = Field(gt=0.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        A, B = self.A_continuous, self.B_continuous
+        if A.shape[0] != A.shape[1]:
+            raise ValueError(f"A_continuous is {shape_text(A)}; it must be square")
+        if B.shape[0] != A.shape[0]:
+            raise ValueError(
+                f"B_continuous is {shape_text(B)}; A_continuous is {shape_text(A)}, so both need as many rows"
+            )
+        return self
+
+
+CONTINUOUS = tuple(Continuous.model_fields)
+
+
 class Plant(Model):
-    """Eq. (1): x(k+1) = A x(k) + B w(k), z(k) = M x(k). A: (nx, nx), B: (nx, nw), M: (nz, nx)."""
+    """Eq. (1): x(k+1) = A x(k) + B w(k), z(k) = M x(k). A: (nx, nx), B: (nx, nw), M: (nz, nx).
+
+    A plant of continuous time has A_continuous, B_continuous and `sample_time`, in one unit of time, in place of A and
+    B, which follow from them (`sampling`); a saved problem has both, and they have to agree.
+    """
 
     A: Matrix
     B: Matrix
     M: Matrix
+    A_continuous: Matrix | None = None
+    B_continuous: Matrix | None = None
+    sample_time: Number | None = Field(default=None, gt=0.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_sampled(cls, document: Any) -> Any:
+        given = {key: document.get(key) for key in CONTINUOUS} if isinstance(document, dict) else {}
+        missing = [key for key, value in given.items() if value is None]
+        if len(missing) == len(given):
+            return document
+        if missing:
+            raise ValueError(f"{missing[0]} is missing; a plant of continuous time has {listed(CONTINUOUS)}")
+        if ("A" in document) != ("B" in document):
+            raise ValueError(f"A and B follow from {listed(CONTINUOUS)}; leave both out")
+        try:
+            known = Continuous.model_validate(given)
+        except ValidationError as error:
+            raise ValueError(first_fault(error, given)) from None
+        A, B = sampled(known.A_continuous, known.B_continuous, known.sample_time)
+        for key, matrix in (("A", A), ("B", B)):
+            if document.get(key, matrix.tolist()) != matrix.tolist():
+                raise ValueError(f"{key} is not what {listed(CONTINUOUS)} make of it; leave A and B out, or those")
+        return {**document, "A": A.tolist(), "B": B.tolist()}
 
     @model_validator(mode="after")
     def _check(self) -> Self:
