@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import peakmesh
 import pytest
 from made_recordings import observer_gains, real_problem
 from places import GOLDEN
@@ -43,7 +44,7 @@ PLANT, NODES = LOSSY.plant, LOSSY.nodes
 
 def modules() -> Iterator[Any]:
     """Every module of both packages."""
-    for package in (agent, designer):
+    for package in (agent, designer, peakmesh):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if not found.name.endswith("__main__"):
                 yield importlib.import_module(found.name)

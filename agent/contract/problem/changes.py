@@ -10,6 +10,7 @@ from agent.contract.frozen import plain
 
 EVERY = "*"  # a name that stands for all of them
 _REPLACED = {"disturbance"}  # not merged: what one kind says means nothing to another
+_INSTEAD = {"hears": "adjacency", "adjacency": "hears"}  # who says one does not say the other
 _NAMED = {"node", "topology"}  # lists of tables, told apart by their names
 
 
@@ -66,6 +67,11 @@ def _each(kind: str, tables: list[dict[str, Any]], changes: Mapping[str, Mapping
     for name in changes:
         if name != EVERY and name not in names:
             raise InputError(f'{kind} "{name}" does not exist; there are {listed(names)}, and "{EVERY}" for all')
-    return [
-        table | plain(dict(changes.get(EVERY, {}))) | plain(dict(changes.get(table["name"], {}))) for table in tables
-    ]
+    return [_table(table, changes.get(EVERY, {}), changes.get(table["name"], {})) for table in tables]
+
+
+def _table(table: dict[str, Any], *changes: Mapping[str, Any]) -> dict[str, Any]:
+    for change in changes:
+        kept = {key: value for key, value in table.items() if _INSTEAD.get(key) not in change}
+        table = kept | plain(dict(change))
+    return table

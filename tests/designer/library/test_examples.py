@@ -36,12 +36,11 @@ def test_the_page_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.Monkey
     assert {"gains.json", "run.mcap", "errors.pdf"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_readme_shows_a_part_of_the_page() -> None:
-    section = (ROOT / "README.md").read_text().partition("## As a library")[2].partition("\n## ")[0]
-    assert len(section.strip().splitlines()) < 30
-    (code, _), (test, _) = blocks(section)
-    assert test in PAGE
-    compile(code, "README.md", "exec")
+def test_the_readme_shows_lines_of_the_page() -> None:
+    """So that they are run above."""
+    section = (ROOT / "README.md").read_text().partition("\n## As a library\n")[2].partition("\n## ")[0]
+    ((code, _),) = blocks(section)
+    assert set(code.splitlines()) <= set(PAGE.splitlines())
 
 
 def run(name: str, *arguments: object) -> tuple[list[str], int]:

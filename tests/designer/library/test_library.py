@@ -107,6 +107,8 @@ def test_a_copy_has_what_was_changed_and_nothing_stale() -> None:
     assert np.array_equal(copy.plant.B, problem.plant.B)
     assert (copy.name, copy.disturbance.kind, copy.topologies) == ("mine", "impulse", problem.topologies)
     assert problem.with_() == problem
+    apart = problem.with_(topology={"*": {"hears": {}}, "1": {"adjacency": np.ones((4, 4))}})
+    assert [len(apart.neighbours(s, 0)) for s in range(4)] == [4, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
