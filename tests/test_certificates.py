@@ -103,6 +103,15 @@ def test_no_probability_is_above_1(check, tmp_path: Path) -> None:
     assert check(path)[0] == UNDECIDED
 
 
+def test_what_it_does_not_know_it_does_not_decide(check, tmp_path: Path) -> None:
+    """A problem file that says more some day may mean another model."""
+    document = json.loads(CORRECT[0].read_text())
+    document["problem"]["node"][0]["weight"] = 0.5
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    assert check(path)[0] == UNDECIDED
+
+
 def test_the_own_gain_of_an_unbiased_node_is_the_exact_one(check, tmp_path: Path) -> None:
     """A less all others, as the node steps by; the one in the file, which is that rounded, is not used."""
     document = json.loads(next(path for path in CORRECT if path.stem == "unbiased").read_text())

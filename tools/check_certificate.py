@@ -9,6 +9,7 @@ import json, sys
 from fractions import Fraction as Q
 from math import lcm, prod
 BITS, STEPS, ORDER = 96, 2000, 50  # of a rounded number; of a recursion; the longest [w; eta] that is tried
+KNOWN = "name plant A B M node C D arrival_probability loss link topology markov unbiased disturbance"  # of a problem
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
 eye = lambda size, by=Q(1): [[by * (i == j) for j in range(size)] for i in range(size)]
@@ -31,6 +32,7 @@ def chance(name, p, form):  # 1 with probability p, else 0, times a form: p and 
     return more | {key: scaled(X, p) for key, X in form.items()}
 def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for every mode; M'M; Pi; lengths of w and x
     (A, B, M), nodes, modes, nu = (p["plant"][letter] for letter in "ABM"), p["node"], [], []
+    assert {*p, *p["plant"], *sum(map(list, nodes), [])} <= {*KNOWN.split()}, f"the problem says more than {KNOWN}"
     names, beta, seen = zip(*((v["name"], v["arrival_probability"], v.get("loss") == "seen") for v in nodes))
     rho = {(link["receiver"], link["sender"]): link["delivery_probability"] for link in p.get("link") or ()}
     nw, nx, n = len(B[0]), len(A), len(nodes)
@@ -57,7 +59,6 @@ def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for 
         modes.append([(prod(q * (1 - q) for *_, q in key), V[key]) for key in V])  # the variance of 0 or 1 is p (1 - p)
     z = [row[nw:] for x_i in x_hat for row in times(M, less(x, x_i))]
     return modes, times(turned(z), z), [[a / sum(row) for a in row] for row in Pi], nw, n_x
-
 def eliminated(X, count):  # what is left of symmetric X, None: all pivots were > 0; or None, v with v'Xv <= 0, v not 0
     if not count: return X, None
     pivot, *row = X[0]
@@ -69,7 +70,6 @@ def rounded(Y, up):  # short fractions; as a matrix not below Y (up = 1), or not
     grid = [Q(2) ** ((row[i].numerator.bit_length() - row[i].denominator.bit_length()) // 2) for i, row in enumerate(Y)]
     Z = [[Q(round(a / (c * d) * 2**BITS), 2**BITS) * c * d for a, d in zip(row, grid)] for row, c in zip(Y, grid)]
     return added(Z, blocks(*([[up * c**2 * Q(len(Y), 2**BITS) * any(row)]] for c, row in zip(grid, Y))))
-
 def decide(file):  # the exit code, and in words what of the file is proved or false
     (modes, MM, Pi, nw, n_x), claim = model(file["problem"], file["K"], file["H"]), file["certificate"]
     names, nodes = ([part["name"] for part in file["problem"][kind]] for kind in ("topology", "node"))
