@@ -15,11 +15,19 @@ class Roles:
     """A coordinator that waits, at `address`; `start` starts everybody else, all of them until the end of the test."""
 
     def __init__(
-        self, stack: ExitStack, gains: Path, recording: Path, *plan: object, run: str = "zhu2020-lossy"
+        self,
+        stack: ExitStack,
+        gains: Path,
+        recording: Path,
+        *plan: object,
+        run: str = "zhu2020-lossy",
+        keys: Path | None = None,
     ) -> None:
-        """`plan` are options of the coordinator, `run` is the name."""
+        """`plan` are options of the coordinator, `run` is the name; with `keys` nobody else can take part."""
         self._stack, self.gains, self.recording, self.run = stack, gains, recording, run
-        words = ["coordinator", gains, "--listen", "tcp/127.0.0.1:0", "--run", run, "--wait", PATIENCE, *plan]
+        self.keys = () if keys is None else ("--keys", keys)
+        listen = "--listen", f"{'tcp' if keys is None else 'tls'}/127.0.0.1:0", *self.keys
+        words = ["coordinator", gains, *listen, "--run", run, "--wait", PATIENCE, *plan]
         self.coordinator = stack.enter_context(started(*words))
         self.address = line_with(self.coordinator, "listening at").split()[-1]
 
@@ -33,5 +41,5 @@ class Roles:
         return self._role("node", "--node", name)
 
     def _role(self, role: str, *words: object) -> Popen[str]:
-        common = "--run", self.run, "--connect", self.address, "--wait", PATIENCE
+        common = "--run", self.run, "--connect", self.address, "--wait", PATIENCE, *self.keys
         return self._stack.enter_context(started(role, self.gains, *words, *common))

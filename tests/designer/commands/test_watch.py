@@ -20,9 +20,11 @@ from places import GOLDEN
 from roles import Roles
 from runs import MANY, PATIENCE, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
 
+from agent.authority import Authority
 from agent.contract.errors import Interrupted
 from agent.contract.gains import Gains
 from agent.contract.messages import Estimate, PlantState
+from agent.contract.rights import everybody
 from agent.network.arrivals import Arrival
 from agent.network.words import Sample
 from agent.plan import Pace
@@ -95,6 +97,25 @@ def test_it_watches_a_run_from_the_middle_and_leaves_without_harm(run: Roles, tm
         watched_to_its_end(run, log)
     assert replay(run.recording).agrees
     what_was_shown_is_what_was_recorded(run.recording, [*states, once])
+
+
+def test_it_watches_a_run_with_keys(tmp_path: Path) -> None:
+    """Its certificate lets it see all of the run, which nobody without one sees anything of."""
+    keys, problem = tmp_path / "keys", Gains.load(GAINS).problem
+    keys.mkdir()
+    Authority.create(keys, problem.name, days=1).issue(everybody(problem), days=1)
+    with ExitStack() as stack:
+        plan = "--steps", MANY, "--period", "100ms"
+        run = Roles(stack, GAINS, tmp_path / "run.mcap", *plan, run="shown", keys=keys)
+        run.start()
+        line_with(run.coordinator, "the run starts")
+        with started(*watch_of(run), *run.keys, "--json") as watch:
+            states = list(until(watch, is_complete))
+        assert states[-1]["run"] == "shown"
+        assert not states[-1]["gone"]
+        stranger = peakmesh("watch", "--connect", run.address, "--wait", "3", "--once")
+        assert stranger.returncode != 0
+        assert run.coordinator.poll() is None
 
 
 def watched_to_its_end(run: Roles, log: Popen[str]) -> None:
