@@ -142,13 +142,16 @@ def alone(part: Path) -> str:
 
 
 def test_everything_at_once(gains_path: Path, tmp_path: Path) -> None:
-    """A node, the plant, the recorder and the coordinator, one after the other before any of them is back."""
+    """A node, the plant, the recorder and the coordinator, one after the other before any of them is back.
+
+    The recorder goes last but one, long enough after the node to have on disk what the node has said.
+    """
     recording = tmp_path / "run.mcap"
     _, verdict = survived(
         gains_path,
         recording,
-        "kill:node=n2,step=10",
-        "kill:plant,step=11",
+        "kill:node=n2,step=8",
+        "kill:plant,step=10",
         "kill:recorder,step=12",
         "kill:coordinator,step=13",
     )
