@@ -61,7 +61,7 @@ FLOOD = "flood"  # more than are kept for who computes
 UNASKED = "unasked"  # answers to questions that nobody put, words that nobody waits for
 KINDS = (FORGED, UNREADABLE, OVERSIZED, MISSHAPEN, INFINITE, UNTIMELY, MISNUMBERED, REPEATED, FLOOD, UNASKED)
 
-AHEAD = 2 * LARGEST_WINDOW  # steps: modes run a window ahead of the slowest, sensors another one ahead of their node
+AHEAD = 2 * LARGEST_WINDOW  # steps: modes run a window ahead of the slowest, and what answers to them, too
 WINDOW = 1024  # numbers: older ones than that are taken for repeated
 _OF_A_NUMBER, _OF_THE_REST = 26, 512  # bytes of JSON
 _LONGEST_EVENT = 1 << 16
@@ -102,6 +102,7 @@ class Guard:
         self._nodes: frozenset[str] = frozenset()
         self._modes: dict[str, int] = {}  # their places
         self._steps, self._is_paced = 2**63, False
+        self._sensed: frozenset[str] = frozenset()  # topics of sensors: nobody keeps those from measuring ahead
         self._sessions: defaultdict[str, list[str]] = defaultdict(list)  # that are there, in the order of their coming
         self._trusted: dict[str, frozenset[str]] = {}  # those that were the first of their name
         self._tags: dict[str, frozenset[bytes]] = {}
@@ -123,6 +124,7 @@ class Guard:
     def begin(self, *, steps: int, external: tuple[str, ...], paced: bool) -> None:
         """The run begins; `external` are the nodes that a sensor measures, which need not stamp what it sends."""
         self._steps, self._is_paced = steps, paced
+        self._sensed = frozenset(map(measurement, external))
         for node in self._problem.node_names if self._problem is not None else ():
             topic = measurement(node)
             sender = frozenset({sensor_who(node), ""} if node in external else {PLANT})
@@ -181,7 +183,8 @@ class Guard:
         except ValidationError as error:
             kinds = {fault["type"] for fault in error.errors(include_url=False, include_input=False)}
             raise Unfit(INFINITE if kinds == {"finite_number"} else UNREADABLE) from None
-        if message.step >= self._steps or (not self._is_paced and message.step > self.now + AHEAD):
+        is_far = message.step > self.now + AHEAD and not self._is_paced and topic not in self._sensed
+        if is_far or message.step >= self._steps:
             raise Unfit(UNTIMELY)
         self._fit(form, message, stamp)
         return message

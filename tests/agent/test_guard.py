@@ -208,6 +208,13 @@ def test_what_is_far_ahead_is_refused_in_lock_step_alone() -> None:
         assert kind_of(made, change("y", step=NOW + AHEAD + 1)._replace(number=3 + paced)) == kind
 
 
+def test_a_sensor_may_measure_ahead_to_the_end_of_the_run() -> None:
+    made = guard(external=("n0",))
+    made.begin(steps=10**6, external=("n0",), paced=False)
+    readings = [change("y", step=step)._replace(sender="") for step in (NOW + AHEAD + 1, 10**6 - 1, 10**6)]
+    assert [kind_of(made, reading) for reading in readings] == ["", "", UNTIMELY]
+
+
 def test_a_sensor_need_not_stamp_what_it_sends_but_says_it_once() -> None:
     """Two readings of a step, or two sensors of a node: the first one counts. The plant has nothing to say there."""
     for for_record in (False, True):

@@ -20,6 +20,7 @@ from agent.contract.recording import Logged
 from agent.contract.recording.evidence.examiner import Findings, examine
 from agent.contract.recording.parts import files_of, part_path, unfinished
 from agent.contract.recording.reader import RecordingReader
+from agent.guard import AHEAD
 
 FULL = 60_000  # bytes after which a disk is full: the head of a recording and some steps
 
@@ -58,8 +59,9 @@ def wait_for(path: Path, process: subprocess.Popen[str], *, size: int = 0) -> No
 
 # in parts
 def test_a_run_in_parts_has_every_message_once_and_evidence_through_all(pair_path: Path, tmp_path: Path) -> None:
-    recording = tmp_path / "run.mcap"
-    ran = peakmesh("run", pair_path, "--steps", 1200, "--split-size", "1kB", "-o", recording, "--json")
+    """And it goes on for longer than anybody may be ahead of anybody."""
+    recording, steps = tmp_path / "run.mcap", AHEAD + 100
+    ran = peakmesh("run", pair_path, "--steps", steps, "--split-size", "1kB", "-o", recording, "--json")
     assert ran.returncode == 0, ran.stderr
     facts, files = answer(ran), files_of(recording)
     assert facts["parts"] == [str(file) for file in files]
@@ -67,8 +69,8 @@ def test_a_run_in_parts_has_every_message_once_and_evidence_through_all(pair_pat
     assert [file.name for file in files] == [part_path(recording, number + 1).name for number in range(len(files))]
     messages = messages_of(*files)
     wire = [(m.topic, m.number) for m in messages if m.topic != EVIDENCE]
-    assert len(set(wire)) == len(wire) == facts["messages"] == 1200 * 6 + 2
-    assert complete_steps(messages) == 1200
+    assert len(set(wire)) == len(wire) == facts["messages"] == steps * 6 + 2
+    assert complete_steps(messages) == steps
     assert examined(*files) == Findings(len(wire), 0, (), (), ())
     ends = [end_of(alone(file)) or {} for file in files]
     assert [end["status"] for end in ends] == ["continues"] * (len(files) - 1) + ["finished"]
