@@ -96,20 +96,21 @@ def test_what_cannot_be_read_is_undecided(old: str, new: str, check, tmp_path: P
 
 def test_no_probability_is_above_1(check, tmp_path: Path) -> None:
     """What is negative of a variance would make up for anything."""
-    document = json.loads(CORRECT[0].read_text())
-    document["problem"]["node"][0]["arrival_probability"] = 1.5
-    path = tmp_path / "gains.json"
-    path.write_text(json.dumps(document))
-    assert check(path)[0] == UNDECIDED
+    assert check(_of_the_first_node(tmp_path, "arrival_probability", 1.5))[0] == UNDECIDED
 
 
 def test_what_it_does_not_know_it_does_not_decide(check, tmp_path: Path) -> None:
     """A problem file that says more some day may mean another model."""
+    assert check(_of_the_first_node(tmp_path, "weight", 0.5))[0] == UNDECIDED
+
+
+def _of_the_first_node(folder: Path, key: str, value: float) -> Path:
+    """A correct file of which the problem says this of its first node."""
     document = json.loads(CORRECT[0].read_text())
-    document["problem"]["node"][0]["weight"] = 0.5
-    path = tmp_path / "gains.json"
+    document["problem"]["node"][0][key] = value
+    path = folder / "gains.json"
     path.write_text(json.dumps(document))
-    assert check(path)[0] == UNDECIDED
+    return path
 
 
 def test_the_own_gain_of_an_unbiased_node_is_the_exact_one(check, tmp_path: Path) -> None:
