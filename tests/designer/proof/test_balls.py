@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx
+from lies import LIES
 
 from agent.contract.arrays import Array
 from designer.proof import balls
@@ -88,18 +89,6 @@ def test_radii_count_where_floats_see_a_zero_too(place: tuple[int, int]) -> None
         S[i, j] = S[j, i] = S[i, j] + arb(0, radius)
         assert by_cholesky(S, np.ones(ORDER)).proved is proved
         assert sign(S, np.ones(ORDER)).proved is proved
-
-
-cholesky = np.linalg.cholesky
-LIES: dict[str, Callable[[Array], Array]] = {
-    "too large": lambda S: cholesky(S + 1.5 * np.eye(len(S))),
-    "too small": lambda S: 1e-3 * cholesky(S + 1.5 * np.eye(len(S))),
-    "nothing": np.zeros_like,
-    "the diagonal": lambda S: np.diag(np.sqrt(S.diagonal() + 1.5)),
-    "noise": lambda S: np.random.default_rng(0).normal(size=S.shape),
-    "not a number": lambda S: np.full_like(S, np.nan),
-    "infinite": lambda S: np.full_like(S, np.inf),
-}
 
 
 def believe(monkeypatch: pytest.MonkeyPatch, lie: str) -> None:

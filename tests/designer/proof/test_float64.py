@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rational
+from lies import LIES, cholesky
 from products import Product, honest, worst
 from rational import Exact, positive_definite
 
@@ -113,17 +114,7 @@ def test_a_lower_bound_is_below_the_least_eigenvalue() -> None:
             assert positive_definite(rational.plus(rational.exact(S), rational.diagonal(np.full(len(S), least)), -1))
 
 
-cholesky, eigh = np.linalg.cholesky, np.linalg.eigh
-LIES: dict[str, Callable[[Array], Array]] = {
-    "too large": lambda S: cholesky(S + 1.5 * np.eye(len(S))),
-    "too small": lambda S: 1e-3 * cholesky(S + 1.5 * np.eye(len(S))),
-    "nothing": np.zeros_like,
-    "the diagonal": lambda S: np.diag(np.sqrt(S.diagonal() + 1.5)),
-    "noise": lambda S: np.random.default_rng(0).normal(size=S.shape),
-    "not a number": lambda S: np.full_like(S, np.nan),
-    "infinite": lambda S: np.full_like(S, np.inf),
-    "huge": lambda S: np.full_like(S, 1e200),
-}
+eigh = np.linalg.eigh
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -(2.0**-40), -(2.0**-20), -1.0])
