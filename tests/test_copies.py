@@ -29,6 +29,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
 from agent.contract.problem.parts import Continuous
+from agent.contract.problem.uncertainty import OfChain, OfLink, OfNode, OfPlant, Uncertainty
 from designer import analysis, problems
 from designer.model.error_model import ErrorModel, Stacks, error_model, stacked_gains, stacks
 from designer.replay.central import Central
@@ -99,6 +100,11 @@ def examples() -> dict[type, Frozen]:
         Samples(kind="csv", file="w.csv", values=np.ones((2, 1))),
         WorstCase(kind="worst-case"),
         Quiet(),
+        OfPlant(A=[[0.1, "2%"]]),
+        OfNode(C="1%", arrival_probability=[0.1, 0]),
+        OfLink(delivery_probability=0.1),
+        OfChain(transition=[0.1, 0]),
+        Uncertainty(probabilities="2%"),
         messages.Mode(step=0, mode="1"),
         messages.PlantState(step=0, x=[0.0], z=[0.1], w=[-0.0], arrived=[1]),
         messages.Measurement(step=0, y=[1e-300]),

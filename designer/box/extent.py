@@ -1,4 +1,4 @@
-"""A box of models, as data: how far probabilities may be from those of the file, and its corners.
+"""A box of models, as data: how far numbers may be from those of the file, and its corners.
 
 The gains, and the beta_j in filters that do not see their losses, are those of the file. beta and rho may be anywhere
 in an interval, each by itself; a row of Pi anywhere within a total variation. They may change at every step, and
@@ -8,15 +8,17 @@ depend on all that happened before it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agent.contract.errors import InputError, counted, shortened
 from agent.contract.problem import Problem
+from agent.contract.problem.uncertainty import Tolerance, tolerance
+from designer.box.rows import Row, row_corners
 from designer.proof.ball_model import Truth, told
 
 NAMES = {
@@ -24,17 +26,6 @@ NAMES = {
     "transition": "each row of the transition matrix within so much of total variation: 0.05",
 }
 MOST_CORNERS = 1024
-Row = tuple[Fraction, ...]
-
-
-class Tolerance(NamedTuple):
-    """How far a number may be off: in its own units, or as a part of it."""
-
-    size: Fraction
-    relative: bool
-
-    def of(self, value: float) -> Fraction:
-        return self.size * abs(Fraction(value)) if self.relative else self.size
 
 
 class Interval(NamedTuple):
@@ -79,88 +70,107 @@ def within(texts: Sequence[str]) -> dict[str, Tolerance]:
 
 
 def _tolerance(text: str, size: str, *, relative: bool) -> Tolerance:
-    part, number = size.endswith("%"), size.removesuffix("%")
     try:
-        about = float(number)  # a fraction of 1e999999999 would have as many digits
+        found = tolerance(size if size.endswith("%") else float(size), most=1.0)
     except ValueError:
-        about = math.nan
-    if not 0.0 < about <= (100.0 if part else 1.0) or (part and not relative):
+        found = None
+    if found is None or not found.size or (found.relative and not relative):
         like = "0.02 or 2%" if relative else "0.05"
         raise InputError(
             f'--within {shortened(text)}: "{size}" is no tolerance; it is above 0 and at most 1, like {like}'
         )
-    return Tolerance(Fraction(number) / (100 if part else 1), part)
+    return found if found.relative else found._replace(size=Fraction(size))
 
 
-def box_of(problem: Problem, tolerances: dict[str, Tolerance]) -> Box:
-    """The box around the problem. Raises InputError where there is nothing that may vary, or too much."""
-    probabilities, transition = tolerances.get("probabilities"), tolerances.get("transition")
-    intervals = () if probabilities is None else tuple(_intervals(problem, probabilities))
-    if probabilities is not None and not intervals:
+def box_of(problem: Problem, tolerances: Mapping[str, Tolerance]) -> Box:
+    """The box of these tolerances. Raises InputError where there is nothing that may vary, or too much."""
+    said = ", ".join(f"{name} +- {_text(size)}" for name, size in tolerances.items())
+    box = _Sizes(problem, tolerances, own=False).box(said, where="--within")
+    if "probabilities" in tolerances and not box.intervals:
         raise InputError(f"--within probabilities: {problem.name} has no arrival or delivery probability below 1")
-    if transition is not None and len(problem.topologies) == 1:
+    if "transition" in tolerances and len(problem.topologies) == 1:
         raise InputError(f"--within transition: {problem.name} has one topology, so its transition matrix is certain")
-    rows = tuple(
-        (tuple(row),) if transition is None else row_corners(tuple(row), transition.size)
-        for row in told(problem).transition
-    )
-    said = [f"{name} +- {_text(size)}" for name, size in tolerances.items()]
-    box = Box(intervals, rows, ", ".join(said))
-    if box.corners > MOST_CORNERS:
-        raise InputError(
-            f"--within: the box has {box.corners} corners, of {counted(len(intervals), 'probability')} and rows of "
-            f"the transition matrix; up to {MOST_CORNERS} are looked at"
-        )
     return box
 
 
-def _text(tolerance: Tolerance) -> str:
-    return f"{float(100 * tolerance.size):g} %" if tolerance.relative else f"{float(tolerance.size):g}"
+def box_in(problem: Problem) -> Box | None:
+    """The box that the problem says itself: `uncertainty`, and every `tolerance`. None: it is certain of all it says.
 
-
-def _intervals(problem: Problem, tolerance: Tolerance) -> Iterator[Interval]:
-    for j, node in enumerate(problem.nodes):
-        if node.arrival_probability < 1.0:
-            yield _interval(f'arrival at node "{node.name}"', "beta", (j,), node.arrival_probability, tolerance)
-    for link in problem.links or ():
-        if link.delivery_probability < 1.0:
-            at = problem.node_index(link.receiver), problem.node_index(link.sender)
-            what = f'delivery from "{link.sender}" to "{link.receiver}"'
-            yield _interval(what, "rho", at, link.delivery_probability, tolerance)
-
-
-def _interval(what: str, matrix: str, at: tuple[int, ...], value: float, tolerance: Tolerance) -> Interval:
-    low, high = Fraction(value) - tolerance.of(value), Fraction(value) + tolerance.of(value)
-    cut = low < 0 or high > 1
-    low, high = max(low, Fraction(0)), min(high, Fraction(1))
-    below, above = float(low), float(high)
-    below = below if Fraction(below) <= low else math.nextafter(below, 0.0)
-    above = above if Fraction(above) >= high else math.nextafter(above, 1.0)
-    return Interval(what, matrix, at, below, above, cut)
-
-
-def row_corners(row: Row, distance: Fraction) -> tuple[Row, ...]:
-    """The corners of {pi >= 0, sum pi = 1, sum |pi - row| / 2 <= distance}.
-
-    A linear function of pi is largest where mass `distance` went to one entry, from the others in turn: each gives all
-    that it has before the next gives any.
+    Raises InputError where too much may vary.
     """
-    found: dict[Row, None] = {}
+    said = {} if problem.uncertainty is None else problem.uncertainty.document()
+    for name, parts in (("A, B or M", [problem.plant]), ("C or D", problem.nodes)):
+        own = [part.tolerance.document().keys() - {"arrival_probability"} for part in parts if part.tolerance]
+        if any(own) or said.keys() - {"probabilities", "transition"}:
+            raise InputError(f"{problem.name}: a tolerance of {name} is not proved yet; leave it out")
+    general = {name: tolerance(size) for name, size in said.items()}
+    box = _Sizes(problem, general, own=True).box("tolerances of the problem file", where="uncertainty")
+    return box if box.corners > 1 else None
 
-    def take(pi: Row, left: Fraction, t: int) -> None:
-        givers = [s for s, mass in enumerate(pi) if s != t and mass > 0]
-        if left == 0 or not givers:
-            found[pi] = None
+
+def _text(size: Tolerance) -> str:
+    return f"{float(100 * size.size):g} %" if size.relative else f"{float(size.size):g}"
+
+
+class _Sizes:
+    """How far each number may be off: `own`, as it says itself, and else as `general` says of its kind."""
+
+    def __init__(self, problem: Problem, general: Mapping[str, Tolerance], *, own: bool) -> None:
+        self.problem, self.general, self.own = problem, general, own
+
+    def box(self, extent: str, *, where: str) -> Box:
+        box = Box(tuple(self._intervals()), tuple(self._rows()), extent)
+        if box.corners > MOST_CORNERS:
+            raise InputError(
+                f"{where}: the box has {box.corners} corners, of {counted(len(box.intervals), 'probability')} and "
+                f"rows of the transition matrix; up to {MOST_CORNERS} are looked at"
+            )
+        return box
+
+    def _said(self, part: Any, name: str) -> Any:
+        """What the part's own `tolerance` says of it."""
+        return getattr(part.tolerance, name, None) if self.own else None
+
+    def _rows(self) -> Iterator[tuple[Row, ...]]:
+        rows, given = told(self.problem).transition, self._said(self.problem.markov, "transition")
+        if given is None:
+            sizes = [self.general["transition"].size if "transition" in self.general else Fraction(0)] * len(rows)
+        else:
+            sizes = [tolerance(size).size for size in (given if isinstance(given, list) else [given] * len(rows))]
+        for row, size in zip(rows, sizes, strict=True):
+            yield row_corners(tuple(row), size)
+
+    def _intervals(self) -> Iterator[Interval]:
+        problem = self.problem
+        for j, node in enumerate(problem.nodes):
+            what, value = f'arrival at node "{node.name}"', node.arrival_probability
+            yield from self._interval(what, "beta", (j,), value, self._said(node, "arrival_probability"))
+        for link in problem.links or ():
+            at = problem.node_index(link.receiver), problem.node_index(link.sender)
+            what, value = f'delivery from "{link.sender}" to "{link.receiver}"', link.delivery_probability
+            yield from self._interval(what, "rho", at, value, self._said(link, "delivery_probability"))
+
+    def _interval(self, what: str, matrix: str, at: tuple[int, ...], value: float, given: Any) -> Iterator[Interval]:
+        """A probability of 1 is certain, unless it says itself that it is not."""
+        if given is not None:
+            below, above = [tolerance(side) for side in (given if isinstance(given, list) else [given, given])]
+        elif "probabilities" in self.general and value < 1.0:
+            below = above = self.general["probabilities"]
+        else:
             return
-        for s in givers:
-            moved, following = min(left, pi[s]), list(pi)
-            following[s] -= moved
-            following[t] += moved
-            take(tuple(following), left - moved, t)
+        low, high = Fraction(value) - below.of(value), Fraction(value) + above.of(value)
+        if low < high:
+            ends = _outwards(max(low, Fraction(0)), min(high, Fraction(1)))
+            yield Interval(what, matrix, at, *ends, cut=low < 0 or high > 1)
 
-    for t in range(len(row)):
-        take(row, distance, t)
-    return tuple(found)
+
+def _outwards(low: Fraction, high: Fraction) -> tuple[float, float]:
+    """The floats next to both, on the outside."""
+    below, above = float(low), float(high)
+    return (
+        below if Fraction(below) <= low else math.nextafter(below, -math.inf),
+        above if Fraction(above) >= high else math.nextafter(above, math.inf),
+    )
 
 
 def truth_at(problem: Problem, box: Box, ends: Sequence[bool], rows: Sequence[int]) -> Truth:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from agent.contract.errors import InputError
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.box.extent import NAMES, Box, Tolerance, box_of, corners
+from agent.contract.problem.uncertainty import Tolerance
+from designer.box.extent import NAMES, Box, box_of, corners
 from designer.box.robust import ends, invariant, weights_of
 from designer.gain.exact import Operator
 from designer.model.error_model import error_model, stacked_links

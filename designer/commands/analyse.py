@@ -10,7 +10,7 @@ from agent.commands.options import Subcommands, add_command
 from agent.contract.errors import EXIT_GOOD, EXIT_NO
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM, add_set, add_table, find_to_design, refuse_both, tell_notes
-from designer.commands.within import add_within
+from designer.commands.within import add_within, asked
 
 
 def add_analyse(commands: Subcommands) -> None:
@@ -49,14 +49,13 @@ def add_analyse(commands: Subcommands) -> None:
 def analyse_command(options: argparse.Namespace) -> int:
     """`peakmesh analyse PROBLEM --gains FILE`: exit code 1 where the errors are not mean-square stable."""
     from designer.analysis import analyse, certified, load_given
-    from designer.box.extent import box_of, within
     from designer.ladder import rounded_up
 
     refuse_both(options)
     problem = find_to_design(options.problem, options.settings)
     if options.output is not None:
         refuse_overwrite(options.output, force=options.force)
-    box = box_of(problem, within(options.within)) if options.within else None
+    box = asked(problem, options.within)
     given = load_given(options.gains, problem)
     analysis = analyse(problem, given, box, radius=options.radius)
     facts, text = analysis.document() | {"notes": tell_notes(problem), "output": None}, analysis.text()

@@ -6,12 +6,12 @@ import argparse
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from agent.commands.options import Subcommands, add_command, load_gains
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted, listed
 from designer.commands import add_set
-from designer.commands.within import add_within
+from designer.commands.within import add_within, asked
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -21,7 +21,7 @@ PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
     "exact": "mean-square stability by (17), and gamma by the recursion of the exact gain",
 }
-_BESIDE = {"name", "disturbance"}  # what a proof of gamma does not depend on
+_BESIDE = {"name", "disturbance", "tolerance"}  # what a proof of gamma does not depend on
 
 
 def add_verify(commands: Subcommands) -> None:
@@ -41,7 +41,6 @@ def add_verify(commands: Subcommands) -> None:
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS [PROBLEM]`."""
-    from designer.box.extent import box_of, within
     from designer.box.robust import robust
     from designer.problems import find
     from designer.proof.certificate import verify
@@ -50,8 +49,8 @@ def verify_command(options: argparse.Namespace) -> int:
     if options.settings and options.problem is None:
         raise InputError(f"--set {options.settings[0]} is for PROBLEM; name the problem that the gains have to be for")
     gains = load_gains(options.gains)
-    box = box_of(gains.problem, within(options.within)) if options.within else None
-    differs = [] if options.problem is None else _differences(gains.problem, find(options.problem, options.settings))
+    problem = gains.problem if options.problem is None else find(options.problem, options.settings)
+    box, differs = asked(problem, options.within), _differences(gains.problem, problem)
     if set(differs) - _BESIDE:
         return _for_another(gains, options, differs)
     started = time.perf_counter()
@@ -87,8 +86,13 @@ def verify_command(options: argparse.Namespace) -> int:
 
 def _differences(found: Problem, wanted: Problem) -> list[str]:
     """The parts of two problems that differ, as they are called in a problem file."""
-    one, other = found.document(), wanted.document()
-    return sorted(key for key in one.keys() | other.keys() if one.get(key) != other.get(key))
+
+    def differing(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
+        return {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
+
+    differs = differing(found.certain().document(), wanted.certain().document())
+    more = differing(found.document(), wanted.document()) - differs
+    return sorted(differs | ({"tolerance"} if more else set()))
 
 
 def _for_another(gains: Gains, options: argparse.Namespace, differs: list[str]) -> int:

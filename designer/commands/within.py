@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from agent.contract.problem import Problem
+    from designer.box.extent import Box
 
 
 def add_within(parser: argparse.ArgumentParser) -> None:
-    """Add the option; `designer.box.extent.within` reads it."""
+    """Add the option; `asked` reads it."""
     parser.add_argument(
         "--within",
         action="append",
         default=[],
         metavar="NAME=SIZE",
-        help="prove gamma for every model in a box too: probabilities=0.02, or 2%% of each, for those of arrival and "
-        "delivery that are below 1; transition=0.05, total variation of each row; may be repeated",
+        help="prove gamma for every model in a box too, in place of the one that the problem has: probabilities=0.02, "
+        "or 2%% of each, for those of arrival and delivery that are below 1; transition=0.05, total variation of each "
+        "row; may be repeated",
     )
+
+
+def asked(problem: Problem, texts: list[str]) -> Box | None:
+    """The box that gamma is asked for: of --within, or else that of the problem."""
+    from designer.box.extent import box_in, box_of, within
+
+    return box_of(problem, within(texts)) if texts else box_in(problem)

@@ -105,7 +105,8 @@ def _power(sizes: Array) -> Array:
 
 
 def rescaled(problem: Problem, units: Units) -> Problem:
-    """The same problem in the given units; w and y keep theirs."""
+    """The same problem in the given units, without tolerances; w and y keep their units."""
+    problem = problem.certain()
     plant, columns, rows = problem.plant, units.state, units.state[:, None]
     scaled = plant.model_copy(
         update={

@@ -30,5 +30,11 @@ def _is_table(value: Any) -> bool:
 
 
 def _entries(table: dict[str, Any]) -> list[str]:
-    """Text, numbers, true and false, and lists of them are written in TOML as in JSON."""
-    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items() if value is not None]
+    return [f"{key} = {_value(value)}" for key, value in table.items() if value is not None]
+
+
+def _value(value: Any) -> str:
+    """Text, numbers, true and false, and lists of them are written in TOML as in JSON; a table within a line is not."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(_entries(value))} }}"
+    return json.dumps(value, ensure_ascii=False)

@@ -3,7 +3,8 @@
 Not in the paper: losses that a node sees, links that lose messages, gains that are imposed to be unbiased.
 
 `parts` and `disturbance` are what a problem is made of, each checked by itself; `consistency` is what must hold
-between them; `file` is how it is written down, `changes` how Python says it.
+between them; `file` is how it is written down, `changes` how Python says it. `uncertainty` is how far
+numbers may be off what really is.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from agent.contract.errors import InputError, counted, listed
 from agent.contract.problem import changes, consistency, file
 from agent.contract.problem.disturbance import Disturbance, Quiet
 from agent.contract.problem.parts import LossyLink, MarkovChain, Name, Node, Plant, Topology
+from agent.contract.problem.uncertainty import Uncertainty, certain
 from agent.contract.tables import table
 
 
@@ -35,6 +37,7 @@ class Problem(Model):
     markov: MarkovChain
     disturbance: Disturbance = Quiet()
     links: tuple[LossyLink, ...] | None = Field(default=None, alias="link", min_length=1)
+    uncertainty: Uncertainty | None = None
     unbiased: bool | None = Field(default=None, strict=True)  # sum over j of a_ij K_ij = A, imposed; None: it is not
 
     @classmethod
@@ -98,6 +101,10 @@ class Problem(Model):
         Raises InputError: one sentence for what cannot be.
         """
         return self.from_document(changes.changed(self.document(), values))
+
+    def certain(self) -> Self:
+        """A copy without tolerances: all of it is taken to be as it says."""
+        return self.from_document(certain(self.document()))
 
     def __repr__(self) -> str:
         """In a line; `document()` has everything."""

@@ -98,6 +98,12 @@ def check_markov(markov: MarkovChain, modes: Sequence[str]) -> None:
             raise ValueError(f'markov: transition, row of "{name}", holds {wrong}; a probability lies in [0, 1]')
         if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
             raise ValueError(f'markov: transition, row of "{name}", sums to {row.sum():.12g}; it must sum to 1')
+    sizes = None if markov.tolerance is None else markov.tolerance.transition
+    if isinstance(sizes, list) and len(sizes) != len(modes):
+        raise ValueError(
+            f"markov: tolerance of transition has {counted(len(sizes), 'entry')}; it is a number, or one for each of "
+            f"{counted(len(modes), 'topology')}"
+        )
     if markov.initial not in modes:
         raise ValueError(f'markov: initial "{markov.initial}" is no topology; the topologies are {listed(modes)}')
 

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 from agent.contract.arrays import Matrix, Model, Number, shape_text
 from agent.contract.errors import counted, first_fault, listed, shortened
 from agent.contract.problem.sampling import sampled
+from agent.contract.problem.uncertainty import OfChain, OfLink, OfNode, OfPlant, check_shape
 
 
 def _legal_name(name: str) -> str:
@@ -57,6 +58,7 @@ class Plant(Model):
     A_continuous: Matrix | None = None
     B_continuous: Matrix | None = None
     sample_time: Number | None = Field(default=None, gt=0.0)
+    tolerance: OfPlant | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -90,6 +92,8 @@ class Plant(Model):
             raise ValueError(
                 f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {counted(nx, 'column')}"
             )
+        for name in OfPlant.model_fields:
+            check_shape(name, getattr(self.tolerance, name, None), getattr(self, name))
         return self
 
     @property
@@ -111,6 +115,7 @@ class Node(Model):
     D: Matrix
     arrival_probability: Number
     loss: Literal["hidden", "seen"] | None = None
+    tolerance: OfNode | None = None
 
     @property
     def seen(self) -> bool:
@@ -136,6 +141,8 @@ class Node(Model):
                 f"C is {shape_text(self.C)} and D is {shape_text(self.D)}; "
                 "both need one row for each measurement of the node"
             )
+        for name in ("C", "D"):
+            check_shape(name, getattr(self.tolerance, name, None), getattr(self, name))
         return self
 
 
@@ -155,6 +162,7 @@ class LossyLink(Model):
     receiver: str
     sender: str
     delivery_probability: Number
+    tolerance: OfLink | None = None
 
     @field_validator("delivery_probability")
     @classmethod
@@ -169,3 +177,4 @@ class MarkovChain(Model):
 
     transition: Matrix
     initial: str
+    tolerance: OfChain | None = None

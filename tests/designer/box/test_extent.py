@@ -9,7 +9,8 @@ import pytest
 from made_recordings import random_problem, real_problem
 
 from agent.contract.errors import InputError
-from designer.box.extent import box_of, corners, row_corners, within
+from designer.box.extent import box_in, box_of, corners, within
+from designer.box.rows import row_corners
 from designer.problems import find
 
 
@@ -90,3 +91,47 @@ def test_every_end_and_every_row_is_in_a_corner() -> None:
     for s, rows in enumerate(box.rows):
         met = {(tuple(corner.beta), tuple(corner.transition[s])) for corner in every}
         assert len(met) == 16 * len(rows)
+
+
+def test_the_tolerances_of_a_problem_are_its_box_and_its_own_words_come_first() -> None:
+    problem = find("zhu2020-lossy")
+    assert box_in(problem) is None
+    said = problem.with_(uncertainty={"probabilities": 0.02, "transition": 0.05})
+    asked = box_of(problem, within(["probabilities=0.02", "transition=0.05"]))
+    assert box_in(said) == asked._replace(extent="tolerances of the problem file")
+    own = said.with_(
+        node={
+            "2": {"tolerance": {"arrival_probability": [0.25, "10%"]}},
+            "3": {"tolerance": {"arrival_probability": 0}},
+        },
+        markov={"tolerance": {"transition": [0, 0.05, 0, 0]}},
+    )
+    box = box_in(own)
+    assert box is not None
+    ends = {part.at: (part.low, part.high) for part in box.intervals}
+    assert ends.keys() == {(0,), (1,), (3,)}
+    assert ends[1,] == pytest.approx((0.6, 0.935), abs=1e-15)
+    assert [len(rows) > 1 for rows in box.rows] == [False, True, False, False]
+    assert box.rows[1] == asked.rows[1]
+
+
+def test_a_probability_of_1_is_certain_unless_it_says_that_it_is_not() -> None:
+    problem = find("zhu2020-ideal").with_(uncertainty={"probabilities": 0.02})
+    assert box_in(problem) is None
+    box = box_in(problem.with_(node={"1": {"tolerance": {"arrival_probability": 0.02}}}))
+    assert box is not None
+    assert [(part.at, part.high, part.cut) for part in box.intervals] == [((0,), 1.0, True)]
+
+
+def test_a_tolerance_moves_with_the_value_beside_it() -> None:
+    problem = find("zhu2020-lossy").with_(node={"1": {"tolerance": {"arrival_probability": [0.01, 0.02]}}})
+    for value in (0.5, 0.8):
+        box = box_in(problem.with_(node={"1": {"arrival_probability": value}}))
+        assert box is not None
+        assert (box.intervals[0].low, box.intervals[0].high) == pytest.approx((value - 0.01, value + 0.02), abs=1e-15)
+
+
+def test_a_box_of_too_many_corners_is_refused_in_a_problem_too() -> None:
+    many = real_problem(0, unbiased=False, ny=(1,) * 8, modes=3).with_(uncertainty={"probabilities": 0.1})
+    with pytest.raises(InputError, match=r"uncertainty: the box has .* corners"):
+        box_in(many)
