@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -40,25 +41,31 @@ def design(
     budget: float = BUDGET,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
+    peak_slack: float = 0.0,
 ) -> Gains:
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
     The default method is "exact"; for more than 200 nodes of whom some hear very many others it is "decomposed".
     `progress` and `budget` are for the method "exact", which returns its best gains when its seconds are over, the
     proof after that, and on KeyboardInterrupt. `dask`: the address of a cluster for the windows of large networks.
+    `peak_slack`, for that method too: gamma may be that part larger than the least one, for gains with less noise.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.
     """
     method = default_method(problem) if method is None else method
     if method not in methods():
         raise InputError(f'method "{method}" does not exist; the methods are {listed(methods())}')
+    if peak_slack and method != EXACT:
+        raise InputError(f"--peak-slack starts from the least peak that method exact finds; method {method} has none")
+    if not 0.0 <= peak_slack < math.inf:
+        raise InputError(f"--peak-slack {peak_slack:g}: a part of gamma, 0 or more; 0.05 and 5% are the same")
     refuse_nothing_to_estimate(problem)
     refuse_hopeless(problem)
     if method in BASELINES:
         return with_worst_case(design_baseline(problem, method))
     try:
         if method == EXACT:
-            gains = _exact_in_natural_units(problem, Budget(budget), progress, dask)
+            gains = _exact_in_natural_units(problem, budget, progress, dask, peak_slack)
         else:
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:
@@ -68,7 +75,11 @@ def design(
 
 
 def _exact_in_natural_units(
-    problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None, dask: str | None
+    problem: Problem,
+    budget: float,
+    progress: Callable[[Progress], None] | None,
+    dask: str | None,
+    slack: float,
 ) -> Gains:
     """The same gains whatever the units: a problem in other powers of two of them is the same one, number by number.
 
@@ -79,9 +90,10 @@ def _exact_in_natural_units(
     if progress is not None and unit != 1.0:
 
         def tell(at: Progress) -> None:
-            progress(at._replace(gamma=unit * at.gamma))
+            noise = None if at.noise is None else unit**2 * at.noise
+            progress(at._replace(gamma=unit * at.gamma, noise=noise))
 
-    gains = design_exact(natural.problem, budget=budget, progress=tell, dask=dask, unit=unit)
+    gains = design_exact(natural.problem, budget=Budget(budget), progress=tell, dask=dask, unit=unit, slack=slack)
     K, H = natural.back(gains.K, gains.H)
     certificate = _in_units_of(gains.certificate, unit)
     small = problem.n * problem.nx <= _PROVED_STATES

@@ -57,6 +57,13 @@ def add_design(commands: Subcommands) -> None:
         metavar="ADDRESS",
         help="the designs of --price, or the windows of more than 200 nodes, run on this Dask cluster",
     )
+    design.add_argument(
+        "--peak-slack",
+        type=share,
+        default=0.0,
+        metavar="PART",
+        help="gamma may be so much above the least one, 5%% or 0.05, for gains that let through the least noise",
+    )
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     add_table(design, "the ladder")
     design.add_argument("--json", action="store_true", help="print one JSON object")
@@ -81,6 +88,14 @@ def duration(text: str) -> float:
     return float(found[1]) * {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}[found[2]]
 
 
+def share(text: str) -> float:
+    """0.05 of "5%" or "0.05"."""
+    found = re.fullmatch(r"(\d+(?:\.\d*)?(?:[eE]-?\d+)?)(%|)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f'"{text}" is no part of gamma; write 5% or 0.05')
+    return float(found[1]) / (100.0 if found[2] else 1.0)
+
+
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
     from designer.ladder import ladder_of
@@ -91,7 +106,13 @@ def design_command(options: argparse.Namespace) -> int:
     if options.price:
         return _price_command(problem, options)
     gains, result = design_and_save(
-        problem, options.method, options.output, force=options.force, budget=options.budget, dask=options.dask
+        problem,
+        options.method,
+        options.output,
+        force=options.force,
+        budget=options.budget,
+        dask=options.dask,
+        peak_slack=options.peak_slack,
     )
     if options.table:
         print(ladder_of(gains).table(problem.name, options.table), end="")
@@ -121,6 +142,7 @@ def design_and_save(
     force: bool,
     budget: float | None = None,
     dask: str | None = None,
+    peak_slack: float = 0.0,
 ) -> tuple[Gains, dict[str, Any]]:
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
@@ -139,7 +161,9 @@ def design_and_save(
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
     with stoppable():
-        gains = design(problem, method=method, budget=budget, progress=_descent_progress(), dask=dask)
+        gains = design(
+            problem, method=method, budget=budget, progress=_descent_progress(), dask=dask, peak_slack=peak_slack
+        )
     if gains.solver.status.startswith("out of time"):
         print(
             f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
@@ -225,11 +249,14 @@ def _descent_progress() -> Callable[[Progress], None]:
         nonlocal shown
         if progress.seconds >= shown + 2.0:
             shown = progress.seconds
-            print(
-                f"{progress.seconds:5.0f} s  from {progress.start}, {counted(progress.steps, 'change')} on: "
-                f"gamma over {progress.horizon} steps < {progress.gamma:.6g}; Ctrl-C keeps the best so far",
-                file=sys.stderr,
+            so_far = (
+                f"from {progress.start}, {counted(progress.steps, 'change')} on: gamma over {progress.horizon} steps "
+                f"< {progress.gamma:.6g}"
+                if progress.noise is None
+                else f"{counted(progress.steps, 'change')} on: noise over {progress.horizon} steps < "
+                f"{progress.noise:.6g}, gamma < {progress.gamma:.6g}"
             )
+            print(f"{progress.seconds:5.0f} s  {so_far}; Ctrl-C keeps the best so far", file=sys.stderr)
 
     return show
 
@@ -240,6 +267,8 @@ def _price_command(problem: Problem, options: argparse.Namespace) -> int:
 
     if options.table:
         raise InputError("--table prints the ladder of one design; --price has a table of its own, and --json")
+    if options.peak_slack:
+        raise InputError("--peak-slack is for one design; --price compares the least peaks")
     if options.budget is not None:
         raise InputError("--budget is for one design; --price goes to the end of each search, that all compare")
     if options.output is not None:

@@ -20,6 +20,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator
+from designer.gain.noise import long_run
 from designer.gain.sensitivity import Inputs, Slope, Sweep, slope, sweep
 from designer.model.error_model import ErrorModel, Indices, error_model
 from designer.model.units import natural_units
@@ -72,6 +73,7 @@ class Barrier:
         self.size = len(units)
         self._X = np.broadcast_to(np.diag(units**2), (len(problem.topologies), len(units), len(units)))
         self._nodes, self._moments = self._heard()
+        self._initial = problem.mode_index(problem.markov.initial)
 
     def model(self, v: Array) -> ErrorModel:
         """The error model of the gains v."""
@@ -105,6 +107,42 @@ class Barrier:
 
         return J
 
+    def noise(self, y: float, mu: float) -> bfgs.Function:
+        """log E|z_tilde|^2 under white w of unit covariance, after the horizon, plus mu times J's barrier at g = e^y.
+
+        The covariance of eta that w of steps before the horizon leaves is not there.
+        """
+
+        def J(v: Array) -> tuple[float, Array]:
+            value, gradient = self._inside(np.append(v, y), _KAPPA / mu)
+            if math.isinf(value):
+                return value, gradient[:-1]
+            model, operator = self.model(v), self.operator(v)
+            swept, V, noise = self._noisy(operator)
+            slopes = slope(model, operator, self.inputs, swept, V)
+            by_gains = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
+            return math.log(noise) + mu * value, by_gains / noise + mu * gradient[:-1]
+
+        return J
+
+    def noise_of(self, v: Array) -> float:
+        """E|z_tilde|^2 after the horizon, of the gains v under white w of unit covariance."""
+        return self._noisy(self.operator(v))[2]
+
+    def _noisy(self, operator: Operator) -> tuple[Sweep, Array, float]:
+        """The recursion where w is not the worst one but white: its steps, what is put in at each, and E|z_tilde|^2."""
+        often = long_run(operator.transition, self._initial)
+        Y, noise, Y_bars = operator.MM, 0.0, []
+        for _ in range(self.horizon):
+            Y_bars.append(operator.bar(Y))
+            S = operator.joint(Y_bars[-1])
+            noise += float(often @ np.trace(S[:, operator.size :, operator.size :], axis1=1, axis2=2))
+            Y = S[:, : operator.size, : operator.size]
+        shape = (self.horizon, len(often), operator.nw)
+        none = np.zeros((*shape, operator.nw))
+        swept = Sweep(np.array(Y_bars), np.zeros((*shape, operator.size)), none, 0.0, Y)
+        return swept, none + often[:, None, None] * operator.eye_w, noise
+
     def inverse_hessian(self, x: Array, mu: float, *, ridge: float = 0.0) -> bfgs.Map:
         """Where the search begins: the inverse of part of the Hessian of J + ridge |v|^2 / 2 by [v; y].
 
@@ -117,22 +155,43 @@ class Barrier:
         if found is None:
             return Blocks([], None)
         swept, slopes = found
+        known = self._known(swept, slopes, mu)
+        W = swept.W_inverse * math.exp(x[-1])
+        curvature = mu * float(np.trace(W @ W - W, axis1=2, axis2=3).sum())
+        return self._inverse(known, ridge, None if ridge else 1.0 / max(curvature, _FLAT))
+
+    def inverse_hessian_of_noise(self, v: Array, y: float, mu: float) -> bfgs.Map:
+        """The same of `noise`, by v."""
+        swept, V, value = self._noisy(self.operator(v))
+        slopes = slope(self.model(v), self.operator(v), self.inputs, swept, V, entries=self._moments)
+        found = self._swept(np.append(v, y), 0.0, moments=True)
+        if found is None:
+            return Blocks([], None)
+        both = zip(self._known(swept, slopes, 1.0 / value), self._known(*found, mu), strict=True)
+        return self._inverse([noise + inside for noise, inside in both], 0.0, None)
+
+    def _known(self, swept: Sweep, slopes: Slope, mu: float) -> list[Array]:
+        """By node as `_nodes` has them, the sum over steps of 2 mu Y_bar (x) E r r', by the node's part of v."""
         assert slopes.moments is not None
-        blocks = []
+        found = []
         for (s, i), node in self._nodes.items():
             first, c = self.inputs.p + i * self.problem.nx, node.mean.shape[1]
             rows, moments = slice(first, first + self.problem.nx), slopes.moments[:, node.part].reshape(-1, c, c)
             gram = node.mean @ moments @ node.mean.T + sum(V @ moments @ V.T for V in node.noises)
             known = 2.0 * mu * np.tensordot(swept.Y_bar[:, s, rows, rows], gram, (0, 0)).transpose(0, 2, 1, 3)
             units = self.entries.units[node.at]
-            hessian = known.reshape(len(node.at), -1) * np.outer(units, units)
-            hessian += ridge * np.eye(len(node.at))
+            found.append(known.reshape(len(node.at), -1) * np.outer(units, units))
+        return found
+
+    def _inverse(self, known: list[Array], ridge: float, last: float | None) -> Blocks:
+        """Of each block, damped."""
+        blocks = []
+        for node, part in zip(self._nodes.values(), known, strict=True):
+            hessian = part + ridge * np.eye(len(node.at))
             roots = np.sqrt(np.where(hessian.diagonal() > 0.0, hessian.diagonal(), 1.0))
             sizes = np.outer(roots, roots)
             blocks.append((node.at, np.linalg.inv(hessian / sizes + _DAMPING * np.eye(len(node.at))) / sizes))
-        W = swept.W_inverse * math.exp(x[-1])
-        curvature = mu * float(np.trace(W @ W - W, axis1=2, axis2=3).sum())
-        return Blocks(blocks, None if ridge else 1.0 / max(curvature, _FLAT))
+        return Blocks(blocks, last)
 
     def _inside(self, x: Array, kappa: float) -> tuple[float, Array]:
         """-sum of log det (I - B'Y_bar B / g) + kappa tr(X_0 Y_T) / g by [v; y]; infinite where gamma_T^2 >= g."""

@@ -55,6 +55,7 @@ class Progress(NamedTuple):
     gamma: float
     seconds: float
     horizon: int  # T; the exact gain is that of all steps
+    noise: float | None = None  # E|z_tilde|^2 in hand, where that is what falls
 
 
 class Candidate(NamedTuple):

@@ -21,6 +21,7 @@ from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
 from designer.search.descent import Budget, Descent, Progress, descend
 from designer.search.effort import in_windows, refuse_without_memory, whole_fits
+from designer.search.quiet import Found, quieter
 from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
 from designer.search.windows import WEIGHT as WEIGHT_OF_WINDOWS
 from designer.search.windows import window_gains
@@ -45,8 +46,11 @@ def design_exact(
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
     unit: float = 1.0,
+    slack: float = 0.0,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
+
+    With `slack` those of least noise whose exact gain is at most 1 + slack times that one.
 
     `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
     when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
@@ -79,32 +83,38 @@ def design_exact(
         descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress)
-    solved = time.perf_counter()
     chosen = descent.chosen
     if not chosen.gain.stable:
         raise Unattainable(
             f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
             f"{chosen.gain.radius:.6g} in each step, and less than 1 is needed; {_advice(problem)}"
         )
-    K, H = link_gains(problem, chosen.K_bar, chosen.H_bar)
+    method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
+    if slack:
+        found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress)
+        method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
+        status = f"{_status_of_noise(found, unit)}; before: {status}"
+        gain = exact_gain(error_model(problem, *stacked))
+    solved = time.perf_counter()
+    K, H = link_gains(problem, *stacked)
     try:
-        certificate = certify(problem, K, H, gain=chosen.gain)
+        certificate = certify(problem, K, H, gain=gain)
     except KeyboardInterrupt:  # the search is over, and without a proof nothing would be left of it
-        certificate = certify(problem, K, H, gain=chosen.gain)
+        certificate = certify(problem, K, H, gain=gain)
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
         problem=problem,
         problem_digest=problem.digest(),
-        method="exact",
+        method=method,
         K=K,
         H=H,
         certificate=certificate,
         solver=Solver(
             name="barrier descent, numpy",
             version=np.__version__,
-            status=_status(descent, unit),
-            iterations=descent.steps,
+            status=status,
+            iterations=steps,
             seconds=solved - begun,
         ),
         seconds={
@@ -227,4 +237,13 @@ def _status(descent: Descent, unit: float) -> str:
         f"{descent.ended}; from {descent.start or 'the start'}; "
         f"least {unit * least.gain.high:.6g} (norm {least.norm:.4g}, radius {least.gain.radius:.4g}), "
         f"chosen {unit * chosen.gain.high:.6g} (norm {chosen.norm:.4g}, radius {chosen.gain.radius:.4g})"
+    )
+
+
+def _status_of_noise(found: Found, unit: float) -> str:
+    """How the search for less noise ended, and what it gives for what."""
+    start, gains = found.start, found.gains
+    return (
+        f"{found.ended}; E|z~|^2 under white w from {unit**2 * start.noise:.6g} to {unit**2 * gains.noise:.6g}, "
+        f"gamma from {unit * start.gamma:.6g} to {unit * gains.gamma:.6g}"
     )

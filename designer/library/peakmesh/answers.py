@@ -35,16 +35,19 @@ def design(
     *,
     method: str | None = None,
     budget: float | None = None,
+    peak_slack: float = 0.0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Gains:
     """Gains with a proved gamma (`peakmesh design`); `budget` in seconds, for the method "exact".
+
+    `peak_slack`: gamma may be that part larger than the least one that is found, 0.05 say, for the least noise.
 
     Raises Unattainable where there are none, with the reason as far as it is known, InputError for a bad problem.
     """
     from designer import synthesis
 
     spent = {} if budget is None else {"budget": budget}
-    return synthesis.design(find(problem), method=method, progress=progress, **spent)
+    return synthesis.design(find(problem), method=method, peak_slack=peak_slack, progress=progress, **spent)
 
 
 def analyse(problem: Problem | Name, gains: Gains | Name | tuple[Links, Links]) -> Analysis:

@@ -22,14 +22,15 @@ PROBLEMS = [random_problem(1), random_problem(2), *real_networks(3).values()]
 
 
 @pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
-def test_the_gradients_of_both_barriers_agree_with_differences(problem: Problem) -> None:
+def test_the_gradients_of_all_barriers_agree_with_differences(problem: Problem) -> None:
     """By every direction of the gains that they may take, and of y = log g."""
     barrier = Barrier(problem, 9)
     gains = least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1)
     v = barrier.entries.pack(*gains)
     y = math.log(2.0 * exact_gain(error_model(problem, *barrier.entries.unpack(v))).high ** 2)
     rng = np.random.default_rng(0)
-    for function, x in ((barrier.descent(0.03), np.append(v, y)), (barrier.centre(y, 2.0), v)):
+    functions = (barrier.descent(0.03), np.append(v, y)), (barrier.centre(y, 2.0), v), (barrier.noise(y, 0.03), v)
+    for function, x in functions:
         _, gradient = function(x)
         for _ in range(3):
             direction = 1e-5 * rng.normal(size=len(x))
