@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.gain.exact import node_gains
@@ -22,22 +25,25 @@ class BeyondGamma(NamedTuple):
     """Of gains whose errors are mean-square stable; None where it was not computed, or has not settled."""
 
     names: tuple[str, ...]
+    weights: Array  # (n,)
     noise: SteadyState | None
     gains: list[tuple[float, float]] | None  # of every node's own error
 
     def document(self) -> dict[str, Any]:
         """For --json."""
-        noise, gains = self.noise, self.gains
+        noise, gains = self.noise, self.gains  # of the nodes as they count; what is told is of z - z_hat_i itself
         return {
             "white_noise": None
             if noise is None
             else {
                 "covariance": "identity",
                 "mean_square": noise.total,
-                "nodes": dict(zip(self.names, noise.nodes.tolist(), strict=True)),
+                "nodes": dict(zip(self.names, (noise.nodes / self.weights**2).tolist(), strict=True)),
                 "relative_error": noise.error,
             },
-            "node_gains": None if gains is None else dict(zip(self.names, map(list, gains), strict=True)),
+            "node_gains": None
+            if gains is None
+            else dict(zip(self.names, (np.array(gains) / self.weights[:, None]).tolist(), strict=True)),
         }
 
 
@@ -46,7 +52,7 @@ def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> BeyondGa
     model = error_model(problem, *stacked_links(problem, K, H))
     noise = steady_state(model, initial=problem.mode_index(problem.markov.initial))
     small = problem.n * problem.nx <= _MOST_STATES
-    return BeyondGamma(problem.node_names, noise, node_gains(model) if small else None)
+    return BeyondGamma(problem.node_names, problem.weights, noise, node_gains(model) if small else None)
 
 
 def told(facts: dict[str, Any]) -> list[str]:

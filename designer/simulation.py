@@ -65,6 +65,7 @@ class Network:
     A: Array  # (nx, nx)
     B: Array  # (nx, nw)
     M: Array  # (nz, nx)
+    weights: Array  # (n, 1)
     C: Array  # (sum ny, nx)
     Ce: Array  # (sum ny, n nx): diag{C_1, ..., C_n}
     D: Array  # (sum ny, nw)
@@ -205,6 +206,7 @@ def network_of(gains: Gains, *, steps: int, w: Array | None = None) -> Network:
         A=plant.A,
         B=plant.B,
         M=plant.M,
+        weights=problem.weights[:, None],
         C=np.vstack([node.C for node in problem.nodes]),
         Ce=Ce,
         D=np.vstack([node.D for node in problem.nodes]),
@@ -294,14 +296,14 @@ def _energy(network: Network, steps: int) -> Array:
 
 
 def tally_runs(network: Network, steps: int, ignored: int, seeds: Sequence[int]) -> Tally:
-    """|z_tilde(k)|^2 = sum over nodes of |M e_i(k)|^2 in the runs with these seeds; `ignored` of them are set apart."""
+    """|z_tilde(k)|^2 = sum over nodes of |weight M e_i(k)|^2 in runs with these seeds; `ignored` are set apart."""
     runs, nx, ignored = len(seeds), len(network.A), min(ignored, len(seeds))
     mean, squares, others, peaks = np.empty(steps), np.empty(steps), np.empty(steps), np.zeros(runs)
     inputs = np.empty((steps, nx + network.Ce.shape[1] + network.B.shape[1]))
     largest = np.empty((steps, ignored))
     with np.errstate(over="ignore", invalid="ignore"):  # errors may grow beyond float64, and count as infinite
         for k, state in enumerate(states(network, seeds, steps=steps)):
-            size = ((state.e.reshape(-1, nx) @ network.M.T) ** 2).reshape(runs, -1).sum(axis=1)
+            size = ((state.e.reshape(runs, -1, nx) @ network.M.T * network.weights) ** 2).reshape(runs, -1).sum(axis=1)
             size[np.isnan(size)] = np.inf
             np.maximum(peaks, size, out=peaks)
             mean[k] = size.mean()

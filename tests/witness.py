@@ -114,12 +114,13 @@ class Network:
     def peak(self, node: int | None = None) -> Array:
         """|z_tilde|^2, or that of one node, as a form in eta, for every mode."""
         weight = np.zeros((self.size, self.size))
+        counts = [node.get("weight", 1.0) for node in self.nodes]
         for i in range(len(self.names)):
             if node in (None, i):
                 rows = slice(
                     self.size - (len(self.names) - i) * self.nx, self.size - (len(self.names) - i - 1) * self.nx
                 )
-                weight[rows, rows] = self.M.T @ self.M
+                weight[rows, rows] = (counts[i] * self.M).T @ (counts[i] * self.M)
         return np.array([weight] * len(self.Pi))
 
     @cached_property

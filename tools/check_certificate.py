@@ -9,7 +9,7 @@ import json, sys
 from fractions import Fraction as Q
 from math import lcm, prod
 BITS, STEPS, ORDER = 96, 2000, 50  # of a rounded number; of a recursion; the longest [w; eta] that is tried
-KNOWN = "name plant A B M node C D arrival_probability loss link topology markov unbiased disturbance"  # of a problem
+KNOWN = "name plant A B M node C D arrival_probability loss weight link topology markov unbiased disturbance"  # keys
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
 eye = lambda size, by=Q(1): [[by * (i == j) for j in range(size)] for i in range(size)]
@@ -57,7 +57,7 @@ def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for 
         parts = [{MEAN: x_next}][:n_x] + [next_error(i, a[i], K[s][me], H[s][me]) for i, me in enumerate(names)]
         V = {key: sum((part.get(key) or zeros(nx, order) for part in parts), []) for key in total(*parts)}
         modes.append([(prod(q * (1 - q) for *_, q in key), V[key]) for key in V])  # the variance of 0 or 1 is p (1 - p)
-    z = [row[nw:] for x_i in x_hat for row in times(M, less(x, x_i))]
+    z = [row[nw:] for v, x_i in zip(nodes, x_hat) for row in scaled(times(M, less(x, x_i)), v.get("weight", Q(1)))]
     return modes, times(turned(z), z), [[a / sum(row) for a in row] for row in Pi], nw, n_x
 def eliminated(X, count):  # what is left of symmetric X, None: all pivots were > 0; or None, v with v'Xv <= 0, v not 0
     if not count: return X, None

@@ -28,7 +28,7 @@ _GROWN = 1.001  # the least growth over half of all steps that is not convergenc
 
 
 def floor(problem: Problem) -> float:
-    """sqrt(n lambda_max(M P M')), P = S S' the limit of the predictor Riccati equation of all sensors; or infinity.
+    """|weights| sqrt(lambda_max(M P M')), P = S S' the limit of the Riccati equation of all sensors; or infinity.
 
     { x(k) : y(0..k-1) = 0, energy of w <= 1 } = { S_k v : |v| <= 1 }. One step: x = S v and w with C S v + D w = 0
     give A S v + B w, so S_(k+1) = [A S, B] N with N an orthonormal basis of the kernel of [C S, D]. That is the
@@ -54,7 +54,7 @@ def floor(problem: Problem) -> float:
     grows = reached[-1] > _GROWN * reached[len(reached) // 2]
     if not settled and grows and not _detectable(plant.A, C):
         return math.inf
-    return math.sqrt(problem.n) * reached[-1]
+    return float(np.linalg.norm(problem.weights)) * reached[-1]
 
 
 def _detectable(A: Array, C: Array) -> bool:

@@ -22,7 +22,7 @@ _ROUNDING = 2.0**-52
 
 
 class SteadyState(NamedTuple):
-    """E|z - z_hat_i|^2 of every node under white w of unit covariance, (n,), and by how much their sum may be off."""
+    """E|z - z_hat_i|^2 of every node, as it counts, under white w of unit covariance, (n,); and what may be off."""
 
     nodes: Array
     error: float  # of the total, relative; computed, from what is left of the equation

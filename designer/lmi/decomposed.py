@@ -181,7 +181,7 @@ def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lm
                     _loss(at, j)
                 if problem.delivery[i, j] < 1.0:
                     _link(at, j)
-            mode.peaks.append(_peak(build, problem, Q[s][i], delta))
+            mode.peaks.append(_peak(build, problem, i, Q[s][i], delta))
         modes.append(mode)
     return Lmi(columns, delta, R, modes, build.cones())
 
@@ -323,12 +323,12 @@ def _mean_D(node: Node) -> Array:
     return node.arrival_probability * node.D if node.seen else node.D
 
 
-def _peak(build: Assembly, problem: Problem, Q: Indices, delta: Indices) -> Inequality:
+def _peak(build: Assembly, problem: Problem, i: int, Q: Indices, delta: Indices) -> Inequality:
     """[Q_i(s), M'; M, delta I] >= 0."""
     matrix = build.inequality()
     x, z = matrix.append(problem.nx), matrix.append(problem.nz)
     matrix.add(x, x, Q)
-    matrix.add_number(x, z, problem.plant.M.T)
+    matrix.add_number(x, z, problem.weights[i] * problem.plant.M.T)
     for k in range(problem.nz):
         matrix.add(z[k : k + 1], z[k : k + 1], delta)
     return matrix

@@ -115,7 +115,10 @@ def _mode(problem: Problem, s: int, delta: Any, R: Any, Q: list[list[Any]]) -> W
             balance = balance - rho[i, j] * (1.0 - rho[i, j]) * embed.T @ U[i, j] @ embed
 
     M, nz = plant.M, problem.nz
-    peaks = [cp.bmat([[Q_i, M.T], [M, delta * np.eye(nz)]]) for Q_i in Q[s]]
+    peaks = [
+        cp.bmat([[Q_i, weight * M.T], [weight * M, delta * np.eye(nz)]])
+        for weight, Q_i in zip(problem.weights, Q[s], strict=True)
+    ]
     return WitnessMode(Q[s], X, Y, S, T, U, nodes, losses, link_matrices, balance, peaks)
 
 

@@ -142,7 +142,7 @@ def stacks(problem: Problem) -> Stacks:
         C_beta=C_beta,
         D=D,
         D_beta=D_beta,
-        M=np.asarray(np.kron(np.eye(n), plant.M), dtype=np.float64),
+        M=np.asarray(np.kron(np.diag(problem.weights), plant.M), dtype=np.float64),
         beta=beta,
         alpha=beta * (1.0 - beta),
         rows=slices,

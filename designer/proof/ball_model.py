@@ -77,7 +77,12 @@ class BallModel:
         self.w = list(range(self.size, self.size + problem.nw))
         self.M = arb_mat(n * problem.nz, self.size)
         for i in range(n):
-            add(self.M, range(i * problem.nz, (i + 1) * problem.nz), self.e[i], exact(problem.plant.M))
+            add(
+                self.M,
+                range(i * problem.nz, (i + 1) * problem.nz),
+                self.e[i],
+                exact(problem.plant.M) * arb(float(problem.weights[i])),
+            )
         self.transition = [[arb(pi.numerator) / arb(pi.denominator) for pi in row] for row in self.truth.transition]
         self.sensors = [self._sensor(problem, j) for j in range(n)]
         self.AB: list[arb_mat] = []  # (n_eta, n_eta + nw), of every mode

@@ -159,7 +159,7 @@ class Coupling:
     def error_norms(self) -> Array:
         """|z_tilde(k)| over the nodes that are there, (steps,)."""
         log, n = self.log, self.log.gains.problem.n
-        errors = np.tile(log.z, n) - log.z_hat
+        errors = np.repeat(log.gains.problem.weights, log.gains.problem.nz) * (np.tile(log.z, n) - log.z_hat)
         errors[np.repeat(self.absent(), log.gains.problem.nz, axis=1)] = 0.0
         return np.asarray(np.linalg.norm(errors, axis=1))
 

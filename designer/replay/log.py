@@ -96,8 +96,8 @@ class Log:
 
     def error_norms(self) -> Array:
         """|z_tilde(k)| over all nodes, as logged, (steps,); NaN where a message is missing."""
-        n, nz = self.gains.problem.n, self.gains.problem.nz
-        squares = ((self.z - self.z_hat[:, i * nz : (i + 1) * nz]) ** 2 for i in range(n))
+        weights, nz = self.gains.problem.weights, self.gains.problem.nz
+        squares = ((weight * (self.z - self.z_hat[:, i * nz : (i + 1) * nz])) ** 2 for i, weight in enumerate(weights))
         return np.asarray(np.sqrt(sum(of_node.sum(axis=1) for of_node in squares)))
 
 

@@ -189,7 +189,7 @@ def single_run_gamma(gains: Gains) -> float | None:
         if P is None:
             return None
         M = np.zeros((gains.problem.n * gains.problem.nz, P.shape[1]))
-        M[:, p:] = np.kron(np.eye(gains.problem.n), gains.problem.plant.M)
+        M[:, p:] = np.kron(np.diag(gains.problem.weights), gains.problem.plant.M)
         square = max(np.linalg.eigvalsh(M @ np.linalg.solve((P_s + P_s.T) / 2.0, M.T))[-1] for P_s in P)
     except (InputError, np.linalg.LinAlgError):
         return None

@@ -48,13 +48,16 @@ def real_network(
     delivery: float | Array | None = None,
     unbiased: bool = False,
     radius: float | None = None,
+    weighted: bool = False,
 ) -> Problem:
     """The problem with what is not in the paper.
 
     `seen`: the nodes that see their losses, or all; `delivery`: of every link that some topology has, or (n, n) of
-    each; `radius`: the spectral radius that A is scaled to.
+    each; `radius`: the spectral radius that A is scaled to; `weighted`: every other node counts less.
     """
     document = problem.document()
+    for node in document["node"][1::2] if weighted else ():
+        node["weight"] = 0.3
     for node in document["node"]:
         if seen is True or (seen and node["name"] in seen):
             node["loss"] = "seen"
@@ -86,10 +89,12 @@ def real_networks(seed: int, **shape: Any) -> dict[str, Problem]:
     return {
         "seen": real_network(base, seen=True),
         "links": real_network(base, delivery=rho),
-        "some seen, links": real_network(base, seen=some, delivery=rho),
+        "some seen, links, weighted": real_network(base, seen=some, delivery=rho, weighted=True),
         "unbiased": real_network(base, unbiased=True),
         "unbiased, some seen, links": real_network(base, seen=some, delivery=rho, unbiased=True),
-        "unbiased, seen, links, unstable": real_network(base, seen=True, delivery=rho, unbiased=True, radius=1.1),
+        "unbiased, seen, links, unstable, weighted": real_network(
+            base, seen=True, delivery=rho, unbiased=True, radius=1.1, weighted=True
+        ),
     }
 
 

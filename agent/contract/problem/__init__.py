@@ -181,6 +181,11 @@ class Problem(Model):
         return read_only([node.arrival_probability for node in self.nodes])
 
     @cached_property
+    def weights(self) -> Array:
+        """How much the error of each node counts in z_tilde, (n,)."""
+        return read_only([1.0 if node.weight is None else node.weight for node in self.nodes])
+
+    @cached_property
     def delivery(self) -> Array:
         """Delivery probabilities rho_ij, from node j to node i, (n, n); 1 where no link says otherwise."""
         rho = np.ones((self.n, self.n))

@@ -107,7 +107,8 @@ class Node(Model):
 
     `arrival_probability` is beta_i = P(theta_i(k) = 1) of eq. (3), in (0, 1]. `loss` says what the node knows of
     theta_i(k): "hidden", as in the paper, nothing; "seen": a lost measurement does not arrive at all, and the
-    innovation theta_i (C_i x + D_i w - C_i x_hat_i) is then 0. None stands for "hidden".
+    innovation theta_i (C_i x + D_i w - C_i x_hat_i) is then 0. None stands for "hidden". `weight` is how much the
+    node's error counts: z_tilde has weight (z - z_hat_i) of it. None stands for 1.
     """
 
     name: Name
@@ -115,12 +116,20 @@ class Node(Model):
     D: Matrix
     arrival_probability: Number
     loss: Literal["hidden", "seen"] | None = None
+    weight: Number | None = None
     tolerance: OfNode | None = None
 
     @property
     def seen(self) -> bool:
         """Whether the node knows which of its measurements are lost."""
         return self.loss == "seen"
+
+    @field_validator("weight")
+    @classmethod
+    def _counts(cls, value: float | None) -> float | None:
+        if value is not None and not 1e-6 <= value <= 1e6:
+            raise ValueError(f"{value} is not in [1e-6, 1e6]; 1 counts the node as it is, 0.1 a tenth of its error")
+        return None if value == 1.0 else value
 
     @field_validator("loss")
     @classmethod

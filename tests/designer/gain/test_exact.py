@@ -515,16 +515,16 @@ def silent(problem: Problem, horizon: int) -> tuple[float, Array]:
 def test_the_floor_is_what_a_w_that_no_node_hears_does(kind: str, seed: int) -> None:
     """By linear algebra over 25 steps at once; and every gains' exact gain is above it."""
     problem = real_networks(seed, nw=6)[kind]
-    gain = math.sqrt(problem.n) * silent(problem, 25)[0]
+    gain = float(np.linalg.norm(problem.weights)) * silent(problem, 25)[0]
     assert floor(problem) == pytest.approx(gain, rel=1e-6)
     assert floor(problem) > 0.0
     for K_bar, H_bar in (least_variance_gains(problem), consensus_gains(problem, weight=0.4)):
         assert floor(problem) <= exact_gain(error_model(problem, K_bar, H_bar)).high
 
 
-@pytest.mark.parametrize("kind", ["seen", "unbiased, seen, links, unstable"])
+@pytest.mark.parametrize("kind", ["seen", "unbiased, seen, links, unstable, weighted"])
 def test_that_w_leaves_every_estimate_at_0_whatever_is_lost(kind: str) -> None:
-    """Where losses are seen: each realised path gives |z_tilde|^2 = n |M x|^2, which is why the floor holds for it."""
+    """Where losses are seen: each realised path gives |z_tilde|^2 = |weights|^2 |M x|^2, which is why the floor holds for it."""
     problem = real_networks(1, nw=6)[kind]
     K_bar, H_bar = random_gains(problem, 1)
     model, rng = error_model(problem, K_bar, H_bar), np.random.default_rng(0)
@@ -537,7 +537,9 @@ def test_that_w_leaves_every_estimate_at_0_whatever_is_lost(kind: str) -> None:
             eta = realised(model, int(rng.integers(model.modes)), theta, delivered) @ np.concatenate([eta, w_k])
             x = problem.plant.A @ x + problem.plant.B @ w_k
         np.testing.assert_allclose(eta[model.plant_states :], np.tile(x, problem.n), atol=1e-9)
-        assert np.linalg.norm(model.M @ eta) == pytest.approx(math.sqrt(problem.n) * reached, rel=1e-9)
+        assert np.linalg.norm(model.M @ eta) == pytest.approx(
+            float(np.linalg.norm(problem.weights)) * reached, rel=1e-9
+        )
 
 
 def test_lossy_links_do_not_move_the_floor() -> None:

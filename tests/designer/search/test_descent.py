@@ -92,7 +92,7 @@ def in_other_units(problem: Problem, x: Array, y: Array) -> Problem:
     return Problem.from_document(document)
 
 
-@pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
+@pytest.mark.parametrize("kind", ["some seen, links, weighted", "unbiased, seen, links, unstable, weighted"])
 def test_the_search_does_not_depend_on_units(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Powers of 2 change no rounding: the same start, steps and gamma, bit for bit."""
     for name, value in {"_WEIGHTS": descent._WEIGHTS[:3], "_HORIZON": 10, "_LONGEST": 10}.items():
@@ -136,7 +136,7 @@ def test_any_start_leads_to_the_answer_that_is_known() -> None:
     assert agree(each)
 
 
-@pytest.mark.parametrize("kind", ["some seen, links", "unbiased, seen, links, unstable"])
+@pytest.mark.parametrize("kind", ["some seen, links, weighted", "unbiased, seen, links, unstable, weighted"])
 def test_starts_agree_with_what_real_networks_need(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """From gains that share nothing but their sparsity, within 0.5 %; the result is above the floor and stable."""
     monkeypatch.setattr(descent, "_WEIGHTS", descent._WEIGHTS[:5])
