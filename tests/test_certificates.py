@@ -101,7 +101,7 @@ def test_no_probability_is_above_1(check, tmp_path: Path) -> None:
 
 def test_what_it_does_not_know_it_does_not_decide(check, tmp_path: Path) -> None:
     """A problem file that says more some day may mean another model."""
-    assert check(_of_the_first_node(tmp_path, "weight", 0.5))[0] == UNDECIDED
+    assert check(_of_the_first_node(tmp_path, "delay", 0.5))[0] == UNDECIDED
 
 
 def _of_the_first_node(folder: Path, key: str, value: float) -> Path:
@@ -127,6 +127,7 @@ BROKEN = {  # a line of the checker, what is wrong with it, and a file on which 
     "links are not": ("if 0 < p < 1}", 'if 0 < p < 1 and name[0] == "theta"}', "rho"),
     "all is delivered": ("rho.get((names[i], names[j]), Q(1))", "Q(1)", "Pi-links"),
     "seen is hidden": ("if seen[j] else total", "if not seen[j] else total", "beta-seen"),
+    "all count alike": ('v.get("weight", Q(1))', "Q(1)", "weighted"),
     "x is left out": ('0 if p.get("unbiased") and', "0 if", "gamma-links"),
     "no weights": ("scaled(K_i[names[j]], a[j])", "K_i[names[j]]", "unbiased"),
     "modes as likely": ("a / sum(row) for a in row", "Q(1, len(Pi)) for a in row", "paper-exact"),

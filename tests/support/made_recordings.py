@@ -74,7 +74,7 @@ def real_problem(
     """`random_problem` with a plant of this spectral radius, and what real networks have beside it.
 
     Where losses are `seen`, all that lose measurements see it, and so does the last node, which may lose none. Where
-    `links` lose messages, every second one does.
+    `links` lose messages, every second one does, and the first node's error counts less than others.
     """
     problem = random_problem(seed, **sizes)
     document = problem.document()
@@ -85,6 +85,7 @@ def real_problem(
         for i, node in enumerate(document["node"]):
             node["loss"] = "seen" if i % 2 or i == problem.n - 1 else "hidden"
     if links:
+        document["node"][0]["weight"] = 0.4
         document["link"] = [
             {"receiver": names[i], "sender": names[j], "delivery_probability": 0.6 + 0.1 * (number % 4)}
             for number, (i, j) in enumerate(heard[::2])

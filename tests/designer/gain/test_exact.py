@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -206,8 +207,8 @@ def test_the_interval_closes_on_what_longer_horizons_show(case: Case) -> None:
     model = error_model(*case)
     gain = exact_gain(model)
     rising = [gamma_T(model, horizon) for horizon in (1, 2, 4, 8, 16, 32)]
-    assert rising == sorted(rising)
-    assert rising[-1] <= gain.high
+    assert all(longer >= shorter * (1.0 - 1e-9) for shorter, longer in pairwise(rising))
+    assert rising[-1] <= gain.high * (1.0 + 1e-9)
     assert gain.low * (1.0 - 1e-9) <= gamma_T(model, 400, width=4e-7) <= gain.high * (1.0 + 4e-7)
     assert 0.0 < gain.high - gain.low <= 1e-6 * gain.high
     assert gain.stable
@@ -524,7 +525,7 @@ def test_the_floor_is_what_a_w_that_no_node_hears_does(kind: str, seed: int) -> 
 
 @pytest.mark.parametrize("kind", ["seen", "unbiased, seen, links, unstable, weighted"])
 def test_that_w_leaves_every_estimate_at_0_whatever_is_lost(kind: str) -> None:
-    """Where losses are seen: each realised path gives |z_tilde|^2 = |weights|^2 |M x|^2, which is why the floor holds for it."""
+    """Where losses are seen: each realised path gives |z_tilde| = |weights| |M x|: why the floor holds for it."""
     problem = real_networks(1, nw=6)[kind]
     K_bar, H_bar = random_gains(problem, 1)
     model, rng = error_model(problem, K_bar, H_bar), np.random.default_rng(0)

@@ -29,16 +29,19 @@ def of(problem: Problem, gains: StackedGains) -> SteadyState:
 
 
 def simulated(problem: Problem, gains: StackedGains) -> tuple[Array, Array]:
-    """The mean of |z - z_hat_i|^2 over runs and the last steps, (n,), and the deviation of that mean."""
+    """The mean of |weight (z - z_hat_i)|^2 over runs and the last steps, (n,), and the deviation of that mean."""
     document = problem.document() | {"disturbance": {"kind": "white", "deviation": 1.0}}
     file = uncertified(Problem.from_document(document), *link_gains(problem, *gains), method="given")
     network = network_of(file, steps=STEPS)
-    squares = np.array(
-        [
-            ((state.e.reshape(RUNS, problem.n, problem.nx) @ problem.plant.M.T) ** 2).sum(axis=2)
-            for state in states(network, range(RUNS), steps=STEPS)
-        ]
-    )[-LAST:].mean(axis=0)  # (runs, n)
+    squares = (
+        np.array(
+            [
+                ((state.e.reshape(RUNS, problem.n, problem.nx) @ problem.plant.M.T) ** 2).sum(axis=2)
+                for state in states(network, range(RUNS), steps=STEPS)
+            ]
+        )[-LAST:].mean(axis=0)
+        * problem.weights**2
+    )  # (runs, n)
     return squares.mean(axis=0), squares.std(axis=0) / np.sqrt(RUNS)
 
 

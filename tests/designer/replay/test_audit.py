@@ -94,8 +94,10 @@ def test_errors_and_energy_are_those_of_the_messages(sent: list[Sent], tmp_path:
     assert [message["energy"] for message in steps] == pytest.approx(energy)
     assert [message["error"] for message in steps] == pytest.approx(log.error_norms())
     nodes = [found[f"audit/node/{name}"] for name in NETWORK.problem.node_names]
+    weights = NETWORK.problem.weights
     for k, of_nodes in enumerate(zip(*nodes, strict=True)):
-        assert sum(message["error"] ** 2 for _, message in of_nodes) == pytest.approx(log.error_norms()[k] ** 2)
+        squares = [(weight * message["error"]) ** 2 for weight, (_, message) in zip(weights, of_nodes, strict=True)]
+        assert sum(squares) == pytest.approx(log.error_norms()[k] ** 2)
 
 
 def test_the_bound_is_the_largest_singular_value_of_what_w_does(sent: list[Sent], tmp_path: Path) -> None:

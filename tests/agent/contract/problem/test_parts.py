@@ -67,6 +67,8 @@ REFUSED = [
     (edited("0.75\n", "nan\n"), 'node "left": arrival_probability: must be finite, got nan'),
     (edited("0.75\n", '"0.75"\n'), "node \"left\": arrival_probability: must be a number, got '0.75'"),
     (edited("0.75\n", "true\n"), 'node "left": arrival_probability: must be a number, got True'),
+    (edited("0.75\n", "0.75\nweight = 0.0\n"),
+     'node "left": weight: 0.0 is not in [1e-6, 1e6]; 1 counts the node as it is, 0.1 a tenth of its error'),
     (edited('initial = "apart"', "initial = 1"), "markov: initial: must be a string, got 1"),
 ]  # fmt: skip
 
