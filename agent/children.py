@@ -4,8 +4,9 @@ Importing is most of what it costs to start a role. The nursery (`agent.nursery`
 that has no thread and no session, so that forking it is safe; and what was imported is there once for all.
 
 Requests and answers are JSON, a datagram each. `{"arguments": [...]}`, which goes with the three standard streams, is
-answered `{"born": pid}` or `{"failed": why}`; `{"kill": pid, "signal": number}` is not answered. When a child has ended
-`{"ended": pid, "code": code}` comes, with the code of subprocess: minus the signal that has killed it.
+answered `{"born": pid}` or `{"failed": why}`; so is `{"program": [...], "environment": {...}}`, for a program that is
+not ours. `{"kill": pid, "signal": number}` is not answered. When a child has ended `{"ended": pid, "code": code}`
+comes, with the code of subprocess: minus the signal that has killed it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -38,6 +39,7 @@ class Child:
     def __init__(self, pid: int, stdin: IO[bytes], output: IO[bytes] | None, said: IO[bytes]) -> None:
         self.pid, self.stdin, self.output, self.said = pid, stdin, output, said
         self.code: int | None = None  # once it has ended
+        self.was_killed = False  # by us
 
     def last_words(self) -> str:
         """The last line of its stderr."""
@@ -58,6 +60,7 @@ class Nursery:
         is_short = len(os.fsencode(temporary)) <= LONGEST_FOLDER
         self.folder = Path(tempfile.mkdtemp(prefix="peakmesh-", dir=temporary if is_short else "/tmp"))
         self._children: dict[int, Child] = {}  # those that have not ended
+        self._programs = set[int]()  # children that are not ours
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the nursery
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -73,17 +76,30 @@ class Nursery:
 
     def start(self, arguments: Sequence[str], *, wants_output: bool) -> Child:
         """Start `peakmesh` with these arguments, in a session of its own. Raises RunBroken where that cannot be."""
+        return self._start(arguments[0], {"arguments": list(arguments)}, wants_output=wants_output)
+
+    def host(self, words: Sequence[str], environment: Mapping[str, str]) -> Child:
+        """Start a program that is not ours, with these variables beside those that are there; it has nothing to read.
+
+        All that it starts goes when it ends, but for what leaves its process group.
+        """
+        request = {"program": list(words), "environment": dict(environment)}
+        child = self._start(words[0], request, wants_output=False)
+        child.stdin.close()
+        self._programs.add(child.pid)
+        return child
+
+    def _start(self, what: str, request: dict[str, Any], *, wants_output: bool) -> Child:
         said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the child
         theirs, stdin = os.pipe()
         output, out = os.pipe() if wants_output else (None, os.open(os.devnull, os.O_WRONLY))
         child = Child(0, os.fdopen(stdin, "wb", 0), os.fdopen(output, "rb", 0) if output is not None else None, said)
         try:
             with self._still_there():
-                request = json.dumps({"arguments": list(arguments)}).encode()
-                socket.send_fds(self._socket, [request], [theirs, out, said.fileno()])
+                socket.send_fds(self._socket, [json.dumps(request).encode()], [theirs, out, said.fileno()])
             answer = self._answer()
             if "failed" in answer:
-                raise RunBroken(f"no process could be started for the {arguments[0]}: {answer['failed']}")
+                raise RunBroken(f"no process could be started for the {what}: {answer['failed']}")
         except RunBroken:
             child.close()
             raise
@@ -97,6 +113,7 @@ class Nursery:
     def kill(self, child: Child, number: int = signal.SIGKILL) -> None:
         """Send it a signal, unless it has ended; the nursery knows, whatever has become of the process id."""
         if child.code is None:
+            child.was_killed = child.was_killed or number == signal.SIGKILL
             with suppress(OSError):
                 self._socket.send(json.dumps({"kill": child.pid, "signal": int(number)}).encode())
 
@@ -121,11 +138,14 @@ class Nursery:
     def close(self) -> None:
         """Nobody is left behind. Where the nursery was killed, its children see that their input ends."""
         living = list(self._children.values())
-        with suppress(RunBroken):
+        try:
             for child in living:
                 self.kill(child)
             for child in living:
                 self.wait(child)
+        except RunBroken:  # programs need not heed their input
+            for pid in self._programs & self._children.keys():
+                end_group(pid)
         self._socket.close()
         self._process.wait()
         self._said.close()
@@ -159,6 +179,15 @@ class Nursery:
             said = _last_line(self._said)
             why = f"; it said: {said}" if said else ""
             raise RunBroken(f"the process that the roles are forked from has ended{why}") from None
+
+
+def end_group(pid: int) -> None:
+    """Kill a program that is not ours, and what it has started."""
+    try:
+        os.killpg(pid, signal.SIGKILL)
+    except ProcessLookupError:  # it has no session of its own yet, or is gone
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _last_line(said: IO[bytes]) -> str:

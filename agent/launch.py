@@ -8,10 +8,12 @@ order. Started with SIGINT ignored, it leaves that so, and its children inherit 
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,12 +23,14 @@ from agent.contract.errors import EXIT_INPUT, InputError, Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, PLANT, RECORDER, in_words, node_who
 from agent.contract.recording import parts
+from agent.guests import Guests, Program, programs
 from agent.plan import Plan, RecordingPlan
 from agent.signals import heed, restore
 
 RECORDER_SECONDS = 60.0  # after the coordinator has gone, the recorder has so long to close before it is killed
 MOST_REVIVALS, REVIVAL_SECONDS = 3, 10.0  # a role of a paced run is started again so often in so many seconds
 FAREWELL_SECONDS = 1.0  # after the recorder has gone, the others have so long
+GUEST_SECONDS = 10.0  # and guests
 
 
 def launch(
@@ -41,26 +45,28 @@ def launch(
     report: Callable[[dict[str, Any]], None],
     recording_plan: RecordingPlan | None = None,
     keys: Path | None = None,
+    guests: Guests | None = None,
 ) -> dict[str, Any]:
     """Run everything on this machine; returns the coordinator's summary. `report` gets its words as they come.
 
-    With `keys`, a folder of certificates, nobody else can take part.
+    With `keys`, a folder of certificates, nobody else can take part. `guests` are started in place of our own roles.
 
     Raises what the run ended with: RunBroken, Interrupted, or InputError. No process is left behind. A run that went
     on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
-    began = time.time()
+    began, guests = time.time(), guests or {}
     common = [str(gains_path), "--run", run, "--wait", str(wait), "--deadline", str(plan.deadline), "--child"]
     common += ["--keys", str(keys)] if keys is not None else []
-    commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan)]}
+    commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan), *(["--hosts"] if guests else [])]}
     commands |= {node_who(name): ["node", "--node", name, *common] for name in gains.problem.node_names}
     if not plan.needs_no_plant(gains.problem):
         commands[PLANT] = ["plant", *common]
     options = _recorder_options(recording_plan or RecordingPlan(), force=force)
     commands[RECORDER] = ["recorder", *common, "--output", str(recording), *options]
-    with _Crew(survives=plan.pace is not None, by_sockets=keys is None) as crew:
-        for who, command in commands.items():
-            crew.start(who, command)
+    invite = partial(programs, guests, run=run, gains=str(gains_path))
+    with _Crew(invite, survives=plan.pace is not None, by_sockets=keys is None) as crew:
+        for who in (who for who in commands if who not in guests):
+            crew.start(who, commands[who])
         summary: dict[str, Any] = {}
         for word in crew.words_of_coordinator():
             if "listening" in word:
@@ -81,6 +87,8 @@ def launch(
             if crew.started and kept:
                 error.args = (f"{error}; what was recorded is in {parts.in_words(kept)}",)
             raise
+        for sentence in crew.doubts():
+            report({"warning": sentence})
     if "steps" not in summary:
         raise RunBroken("the coordinator ended without a summary")
     return summary
@@ -110,8 +118,12 @@ def _recorder_options(plan: RecordingPlan, *, force: bool) -> list[str]:
 class _Crew:
     """The processes of one run. Where it `survives`, who ends early is started again."""
 
-    def __init__(self, *, survives: bool, by_sockets: bool) -> None:
-        """Roles meet at Unix sockets that they know, or are told where the coordinator listens."""
+    def __init__(self, invite: Callable[..., dict[str, Program]], *, survives: bool, by_sockets: bool) -> None:
+        """Roles meet at Unix sockets that they know, or are told where the coordinator listens.
+
+        `invite` says what guests to start, once there is an address.
+        """
+        self._invite, self._guests = invite, dict[str, Program]()
         self.started, self.survives, self._by_sockets = False, survives, by_sockets
         self._commands: dict[str, list[str]] = {}
         self._address = ""  # of the coordinator
@@ -124,8 +136,11 @@ class _Crew:
 
     def start(self, who: str, command: list[str]) -> None:
         self._commands[who] = command
-        arguments = [*command, *(["--sockets", str(self._nursery.folder)] if self._by_sockets else [])]
-        self._children[who] = self._nursery.start(arguments, wants_output=who == COORDINATOR)
+        if who in self._guests:
+            self._children[who] = self._nursery.host(*self._guests[who])
+        else:
+            arguments = [*command, *(["--sockets", str(self._nursery.folder)] if self._by_sockets else [])]
+            self._children[who] = self._nursery.start(arguments, wants_output=who == COORDINATOR)
         if self._signal is not None:  # it came before there was anybody to pass it on to
             self._end_run(self._signal)
 
@@ -159,9 +174,12 @@ class _Crew:
             self._commands[COORDINATOR] += ["--listen", address]
             for who in self._children:
                 self._tell(who)
+            self._guests = self._invite(address=address)
+            for who, guest in self._guests.items():
+                self.start(who, guest.words)
 
     def _tell(self, who: str) -> None:
-        if who != COORDINATOR and not self._by_sockets:
+        if who != COORDINATOR and who not in self._guests and not self._by_sockets:
             with suppress(BrokenPipeError):  # it has ended already
                 self._children[who].stdin.write(f"{self._address}\n".encode())
 
@@ -182,9 +200,10 @@ class _Crew:
         """Until all have ended, the recorder first; who lingers is killed, at once where nothing was recorded yet."""
         if self.started:
             self._wait_or_kill(self._children[RECORDER], RECORDER_SECONDS)
-        deadline = time.monotonic() + (FAREWELL_SECONDS if self.started else 0.0)
-        for child in self._children.values():
-            self._wait_or_kill(child, deadline - time.monotonic())
+        now = time.monotonic()
+        for who, child in self._children.items():
+            seconds = GUEST_SECONDS if who in self._guests else FAREWELL_SECONDS
+            self._wait_or_kill(child, now + (seconds if self.started else 0.0) - time.monotonic())
 
     def _wait_or_kill(self, child: Child, seconds: float) -> None:
         if not self._nursery.wait(child, seconds):
@@ -198,8 +217,10 @@ class _Crew:
         if self._signal is not None:
             raise Interrupted(self._signal)
         if self._failed is not None:
-            child = self._children[self._failed]
-            self._raise(child, f"{in_words(self._failed)} ended before the run had started")
+            child, words = self._children[self._failed], f"{in_words(self._failed)} ended before the run had started"
+            if self._failed in self._guests:
+                raise RunBroken(f"{words}: {self._end_of(self._failed)}")
+            self._raise(child, words)
         if code != 0 and not finished:
             self._raise(coordinator, "the coordinator ended without a word")
 
@@ -209,10 +230,28 @@ class _Crew:
             raise RunBroken(f"{otherwise}: killed by {signal.Signals(-code).name}")
         raise (InputError if code == EXIT_INPUT else RunBroken)(f"{words or otherwise}{self._cause(words)}")
 
+    def doubts(self) -> Iterator[str]:
+        """What is not as it should be with guests, though the run has ended well."""
+        for who in self._guests:
+            if self._children[who].code:
+                yield f"{in_words(who)} did not end well after the run: {self._end_of(who)}"
+
+    def _end_of(self, who: str) -> str:
+        """How a guest has ended."""
+        child, how = self._children[who], ""
+        if child.was_killed and child.code == -signal.SIGKILL:
+            how = "had not ended, and was killed"
+        elif child.code is not None:
+            how = f"ended with code {child.code}" if child.code >= 0 else f"died of {signal.Signals(-child.code).name}"
+        said = child.last_words()
+        return f"its command, {shlex.join(self._commands[who])}, {how}{f', and said: {said}' if said else ''}"
+
     def _cause(self, words: str) -> str:
         """The last words of the child that the coordinator's `words` call lost."""
         for who, child in self._children.items():
             own = child.last_words()
+            if who in self._guests and in_words(who) in words:
+                return f"; {self._end_of(who)}"
             if who != COORDINATOR and in_words(who) in words and child.code and own and own not in words:
                 return f"; it said: {own}"
         return ""
@@ -231,7 +270,8 @@ class _Crew:
             for who in ended:
                 self._revive(who)
         elif not self.started and self._failed is None and self._children[COORDINATOR].code is None:
-            self._failed = next((who for who in ended if self._children[who].code), None)
+            bad = [who for who in ended if self._children[who].code or who in self._guests]
+            self._failed = next(iter(bad), None)
             if self._failed is not None:
                 self._end_run(signal.SIGTERM)
 

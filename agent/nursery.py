@@ -6,6 +6,7 @@ started it is gone and every child has ended; only then is the folder of their s
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import json
 import os
@@ -20,11 +21,13 @@ from typing import Any, NoReturn
 
 from setproctitle import setproctitle
 
-from agent.children import LARGEST
+from agent.children import LARGEST, end_group
 from agent.cli import main  # before numpy: it says how many threads that may have
 from agent.contract.errors import EXIT_BROKEN
 from agent.network import bus  # noqa: F401 -- so that children have it already
 from agent.roles import coordinator, node, plant, recorder  # noqa: F401
+
+PR_SET_PDEATHSIG = 1  # of prctl(2): what a process gets when its parent ends
 
 
 def serve(connection: socket.socket, folder: str) -> None:
@@ -35,7 +38,7 @@ def serve(connection: socket.socket, folder: str) -> None:
     signal.signal(signal.SIGCHLD, lambda number, frame: None)
     signal.set_wakeup_fd(ends, warn_on_full_buffer=False)
     gc.freeze()  # nothing of what is here is looked at again, so its pages stay common
-    children, is_wanted, poll = set[int](), True, select.poll()
+    children, is_wanted, poll = dict[int, bool](), True, select.poll()  # whether they are programs that are not ours
     poll.register(ended, select.POLLIN)
     poll.register(connection, select.POLLIN)
     while children or is_wanted:
@@ -51,6 +54,9 @@ def serve(connection: socket.socket, folder: str) -> None:
                 is_wanted = False
             else:
                 _do(json.loads(request), streams, connection, children)
+        if not is_wanted and all(children.values()):  # the run is over for all of ours, and nobody waits for them
+            for pid in children:
+                end_group(pid)
     shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -63,29 +69,36 @@ def _next_request(connection: socket.socket) -> tuple[bytes, list[int]]:
     return request, streams
 
 
-def _do(request: dict[str, Any], streams: list[int], connection: socket.socket, children: set[int]) -> None:
+def _do(request: dict[str, Any], streams: list[int], connection: socket.socket, children: dict[int, bool]) -> None:
     if "kill" in request:
-        if request["kill"] in children:
-            os.kill(request["kill"], request["signal"])
+        pid, number = request["kill"], request["signal"]
+        if children.get(pid) and number == signal.SIGKILL:
+            end_group(pid)
+        elif pid in children:
+            os.kill(pid, number)
         return
     try:
         pid = os.fork()
     except OSError as error:
         _tell(connection, {"failed": error.strerror})
     else:
+        if pid == 0 and "program" in request:
+            _execute(request["program"], request["environment"], streams)
         if pid == 0:
             _become(request["arguments"], streams)
-        children.add(pid)
+        children[pid] = "program" in request
         _tell(connection, {"born": pid})
     for stream in streams:
         os.close(stream)
 
 
-def _tell_who_has_ended(connection: socket.socket, children: set[int]) -> None:
-    for pid in list(children):
+def _tell_who_has_ended(connection: socket.socket, children: dict[int, bool]) -> None:
+    for pid, is_program in list(children.items()):
+        if is_program and os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+            end_group(pid)  # while it is there to be waited for, nobody else can have its number
         which, status = os.waitpid(pid, os.WNOHANG)
         if which:
-            children.remove(pid)
+            del children[pid]
             _tell(connection, {"ended": pid, "code": os.waitstatus_to_exitcode(status)})
 
 
@@ -98,12 +111,7 @@ def _become(arguments: list[str], streams: list[int]) -> NoReturn:
     """Play a role, in the child; it leaves without what Python does at its end, which is the nursery's."""
     code = EXIT_BROKEN
     try:
-        signal.set_wakeup_fd(-1)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        os.setsid()
-        for number, stream in enumerate(streams):
-            os.dup2(stream, number)
-        os.closerange(3, os.sysconf("SC_OPEN_MAX"))
+        _leave_home(streams)
         setproctitle(" ".join(["peakmesh", *arguments]))  # what ps and top show
         code = main(arguments)
     except SystemExit as end:  # argparse's
@@ -115,6 +123,30 @@ def _become(arguments: list[str], streams: list[int]) -> NoReturn:
             with suppress(OSError):
                 stream_object.flush()
         os._exit(code)
+
+
+def _execute(words: list[str], environment: dict[str, str], streams: list[int]) -> NoReturn:
+    """Become a program that is not ours, in the child. It is killed where the nursery is: it may heed nothing."""
+    try:
+        _leave_home(streams)
+        for number in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them
+            signal.signal(number, signal.SIG_DFL)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        os.execvpe(words[0], words, os.environ | environment)
+    except (OSError, ValueError) as error:
+        os.write(2, f"{words[0]}: {error}\n".encode())
+    finally:
+        os._exit(EXIT_BROKEN)
+
+
+def _leave_home(streams: list[int]) -> None:
+    """Have a session of its own, these streams, and nothing else of the nursery's."""
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    os.setsid()
+    for number, stream in enumerate(streams):
+        os.dup2(stream, number)
+    os.closerange(3, os.sysconf("SC_OPEN_MAX"))
 
 
 if __name__ == "__main__":

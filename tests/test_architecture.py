@@ -37,10 +37,10 @@ ROOMS = {
     "agent.roles": "agent.contract.recording agent.estimates agent.faults agent.filter agent.guard agent.inbox "
     "agent.network agent.pacing agent.plan agent.product agent.receipts agent.refusals agent.signals",
     "agent.children": "",
-    "agent.launch": "agent.children agent.contract.recording agent.plan agent.signals",
-    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.guard agent.launch agent.network "
-    "agent.plan "
-    "agent.roles",
+    "agent.guests": "",
+    "agent.launch": "agent.children agent.contract.recording agent.guests agent.plan agent.signals",
+    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.guard agent.guests agent.launch "
+    "agent.network agent.plan agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",

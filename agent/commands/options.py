@@ -64,6 +64,38 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_guest_options(parser: argparse.ArgumentParser) -> None:
+    """Add programs of the user's in place of our own; `guests_of` reads it, and `plan_of` who measures."""
+    places = "{run}, {node}, {address} and {gains} are put in, and are in its environment"
+    for what, about in (
+        ("node", f'start this in place of a node, such as 2="./my_node"; {places}; may be repeated'),
+        ("sensor", 'start this as a sensor, such as 3="python sensor.py {run} {node} {address}", with --external 3'),
+    ):
+        parser.add_argument(f"--{what}", type=_guest, action=Repeated, default=[], metavar="NODE=COMMAND", help=about)
+    parser.add_argument("--plant", metavar="COMMAND", help="start this in place of the plant")
+
+
+def guests_of(options: argparse.Namespace, gains: Gains, plan: Plan) -> dict[str, list[str]]:
+    """What the options of `add_guest_options` ask for. Raises InputError where that cannot be started."""
+    from agent.guests import guests
+
+    for what in ("node", "sensor"):
+        names = [name for name, _ in getattr(options, what)]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"--{what} {name}=...: it is there twice")
+    if options.plant is not None and plan.needs_no_plant(gains.problem):
+        raise InputError(f"--plant {options.plant}: no plant takes part in a paced run where every node has a sensor")
+    return guests(gains, nodes=dict(options.node), sensors=dict(options.sensor), plant=options.plant)
+
+
+def _guest(text: str) -> tuple[str, str]:
+    name, equals, command = text.partition("=")
+    if not (name and equals and command):
+        raise argparse.ArgumentTypeError(f'{text!r} is not NODE=COMMAND, such as 2="./my_node"')
+    return name, command
+
+
 def add_deadline_option(parser: argparse.ArgumentParser, about: str) -> None:
     parser.add_argument("--deadline", type=positive, default=10.0, metavar="S", help=about)
 

@@ -55,6 +55,7 @@ def add_roles(commands: Subcommands, environment: Mapping[str, str] = os.environ
     plant = _role(commands, "plant", plant_command, "take part as the simulated plant")
     coordinator = _role(commands, "coordinator", coordinator_command, "start the run, give out the modes, end it")
     add_plan_options(coordinator)
+    coordinator.add_argument("--hosts", action="store_true", help=argparse.SUPPRESS)  # guests, in a run on one machine
     recorder = _role(commands, "recorder", recorder_command, "write every message to a file")
     add_output_options(recorder, *RECORDING)
     add_recording_options(recorder)
@@ -235,8 +236,8 @@ def _place(options: argparse.Namespace, gains: Gains, who: str) -> Network:
     network = replace(network_of(options, who, gains.problem), largest=largest(gains.problem))
     if options.sockets is None:
         return network
-    listen = network.listen if who == COORDINATOR else ""
-    return replace(network, listen=listen, sockets=sockets(gains.problem, who, options.sockets))
+    listen, hosts = (network.listen, options.hosts) if who == COORDINATOR else ("", False)
+    return replace(network, listen=listen, sockets=sockets(gains.problem, who, options.sockets), hosts=hosts)
 
 
 def network_of(options: argparse.Namespace, who: str, problem: Problem | None) -> Network:

@@ -12,10 +12,12 @@ from agent.commands.options import (
     RECORDING,
     Subcommands,
     add_command,
+    add_guest_options,
     add_output_options,
     add_plan_options,
     add_recording_options,
     default_recording,
+    guests_of,
     load_gains,
     plan_of,
     positive,
@@ -41,6 +43,7 @@ def add_run(commands: Subcommands) -> None:
 def add_run_options(parser: argparse.ArgumentParser, *, output: tuple[str, str] = RECORDING) -> None:
     """The options of `run`, but for what to run and how to record it; `output` is what --output takes, and its help."""
     add_plan_options(parser)
+    add_guest_options(parser)
     add_output_options(parser, *output)
     parser.add_argument(
         "--wait", type=positive, default=60.0, metavar="S", help="seconds to wait for all to start (60)"
@@ -69,13 +72,18 @@ def run_gains(
     from agent.contract.recording.parts import files_of, refuse_recording
     from agent.launch import launch
 
+    external, sensors = options.external, [name for name, _ in options.sensor]
+    options.external = list(dict.fromkeys([*external, *sensors]))
     plan = plan_of(options, gains)
+    guests = guests_of(options, gains, plan)
     run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
     refuse_recording(recording, force=options.force)
     keys = "" if options.keys is None else f" --keys {options.keys}"
     live = f"peakmesh live {path} --run {run}{keys}"
-    with progress(plan.steps, live=live, run=run, external=plan.external) as report:
+    with progress(
+        plan.steps, live=live, run=run, external=[name for name in external if name not in sensors]
+    ) as report:
         summary = launch(
             path,
             gains,
@@ -87,6 +95,7 @@ def run_gains(
             report=report,
             recording_plan=recording_plan,
             keys=options.keys,
+            guests=guests,
         )
     parts = [str(part) for part in files_of(recording)]
     return {"recording": str(recording), "parts": parts, "run": run, "seed": plan.seed, **summary}

@@ -33,6 +33,7 @@ class Network:
     wait: float = 30.0  # seconds
     lease: float = 20.0  # seconds
     routes: bool = False  # takes no part, but passes on what others say
+    hosts: bool = False  # clients may be there though it has sockets
     sockets: Sockets | None = None
     largest: float = math.inf  # bytes: nothing comes in that is larger
     credentials: Credentials | None = None  # with them, everybody must show some

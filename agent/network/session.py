@@ -82,10 +82,10 @@ class Session:
         self._watched: dict[str, bool] = {}  # whether a viewer is there
         self._declared: list[Any] = []  # zenoh drops what nobody holds
         self._kind = network.kind
-        passes_on = network.routes or (who == COORDINATOR and network.sockets is None)  # clients may be there
+        hosts = who == COORDINATOR and (network.sockets is None or network.hosts)  # clients may be there
         self.traced = False  # whether messages are to say when they were where
         self._largest = network.largest
-        with nullcontext() if passes_on else _one_pool():
+        with nullcontext() if network.routes or hosts else _one_pool():
             self._zenoh = _open(network, run)
         self._zid = str(self._zenoh.zid())
         self.identity = f"{time.time_ns():020d}-{self._zid}"  # of two with one name the earlier comes first

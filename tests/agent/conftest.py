@@ -17,10 +17,15 @@ def pair() -> Gains:
 
 
 @pytest.fixture(scope="session")
-def paths(gains: Gains, pair: Gains, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def lone() -> Gains:
+    """One node."""
+    return random_gains(random_problem(1, ny=(2,), modes=2))
+
+
+@pytest.fixture(scope="session")
+def paths(gains: Gains, pair: Gains, lone: Gains, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Files of gains. Every node is a process that takes a quarter of a second to start."""
     folder = tmp_path_factory.mktemp("gains")
-    lone = random_gains(random_problem(1, ny=(2,), modes=2))
     for name, each in (("three", gains), ("pair", pair), ("lone", lone)):
         each.save(folder / f"{name}.json")
     return {path.stem: path for path in folder.iterdir()}

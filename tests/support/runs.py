@@ -19,6 +19,7 @@ from agent.contract.keys import EVIDENCE, model_of
 from agent.contract.messages import Message
 from agent.contract.recording import Logged
 from agent.contract.recording.reader import RecordingReader
+from agent.guests import Guests
 from agent.launch import launch
 from agent.plan import Plan
 
@@ -157,6 +158,8 @@ def run_here(
     do: Callable[[], None] = lambda: None,
     heed: Callable[[dict[str, Any]], None] = lambda word: None,
     keys: Path | None = None,
+    guests: Guests | None = None,
+    wait: float = PATIENCE,
     **plan: Any,
 ) -> dict[str, Any]:
     """Launch a run from this process, call `do` once `at` steps are complete; `heed` gets every word."""
@@ -176,9 +179,10 @@ def run_here(
         run="test",
         recording=recording,
         force=False,
-        wait=PATIENCE,
+        wait=wait,
         report=report,
         keys=keys,
+        guests=guests,
     )
 
 
