@@ -20,7 +20,9 @@ from places import GOLDEN, ROOT
 
 from agent.contract.extras import EXTRAS
 from agent.contract.gains import Gains
+from designer.proof import certificate
 from designer.replay import replay
+from designer.replay.gamma import checked_gamma
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 LOSSY, GAINS = GOLDEN / "zhu2020-lossy.mcap", GOLDEN / "zhu2020-lossy.gains.json"
@@ -132,9 +134,9 @@ def test_commands_work_or_say_in_a_sentence_what_they_need(python: Path, tmp_pat
             assert errors.splitlines()[-1].endswith(f" needs {needed}: pip install 'peakmesh[{EXTRAS[needed]}]'"), words
         else:
             assert code == 0, (words, errors)
-    for recording, certificate in ((LOSSY, "certificate  holds"), (paced, "valid at the end; 7 steps with faults")):
+    for recording, finding in ((LOSSY, "certificate  holds"), (paced, "valid at the end; 7 steps with faults")):
         assert said[f"replay {recording}"][1] == replay(recording).text() + "\n"
-        assert certificate in said[f"replay {recording}"][1]
+        assert finding in said[f"replay {recording}"][1]
 
 
 def test_a_whole_run(python: Path, tmp_path: Path) -> None:
@@ -155,3 +157,15 @@ def test_a_defect_is_no_missing_extra() -> None:
     program = "from agent.contract.extras import needing\nwith needing('it'): import no_such_module"
     ran = run(Path(sys.executable), "-c", program, folder=ROOT)
     assert "ModuleNotFoundError: No module named 'no_such_module'" in ran.stderr
+
+
+def test_a_proof_that_needs_more_is_not_called_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network so large that its proof takes scipy: nothing is said of gamma, and why."""
+
+    def verify(gains: Gains) -> None:
+        raise ModuleNotFoundError("No module named 'scipy'", name="scipy")
+
+    monkeypatch.setattr(certificate, "verify", verify)
+    gamma = checked_gamma(Gains.load(GAINS))
+    assert gamma.failure == "the proof of so large a network needs scipy: pip install 'peakmesh[design]'"
+    assert gamma.text().startswith(f"certificate  NOT CHECKED: {gamma.failure}; ")
