@@ -12,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads on
 
 from agent.commands import keys, roles, run
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_INPUT, EXIT_INTERRUPTED, PeakmeshError
+from agent.contract.extras import needing
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,7 +40,8 @@ def open_streams() -> None:
 def perform(options: argparse.Namespace) -> int:
     """Call the chosen command; an error becomes one sentence on stderr and an exit code."""
     try:
-        code = options.call(options)
+        with needing(options.command):
+            code = options.call(options)
         sys.stdout.flush()
         return int(code)
     except PeakmeshError as error:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -173,18 +174,19 @@ def solution(L: Map, right: Array, *, enough: float = _EXACT) -> Array | None:
 
 def lasting(L: Map, first: Array) -> tuple[Array, float] | None:
     """X >= 0 with L(X) = lambda X for the largest lambda in what L makes of `first`, and lambda; None: not found."""
-    from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
-
     pack, unpack = _packing(*first.shape[:2])
     start = pack(first)
     if not start.any():
         return None
-    if len(start) <= _FEW:  # what L makes of `first` alone: other directions are left out
+    if len(start) <= (_FEW if find_spec("scipy") else _DENSE):
+        # in what L makes of `first` alone: other directions are left out
         basis = _krylov(lambda y: pack(L(unpack(y))), start)
         values, vectors = np.linalg.eig(np.array([basis.T @ pack(L(unpack(y))) for y in basis.T]).T)
         k = int(np.real(values).argmax())
         X = unpack(basis @ np.real(vectors[:, k]))
         return (X if np.trace(X, axis1=1, axis2=2).sum() > 0.0 else -X), float(np.real(values[k]))
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
+
     operator = LinearOperator((len(start), len(start)), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
     try:
         values, vectors = eigs(operator, k=1, v0=start, which="LR", tol=1e-12, maxiter=100)
@@ -217,7 +219,7 @@ def spectral_radius(L: Map, modes: int, n: int) -> float:
     first = pack(L(np.broadcast_to(np.eye(n), (modes, n, n))))
     if not np.isfinite(first).all():
         return np.inf
-    if order > _FEW:
+    if order > _FEW and find_spec("scipy"):
         from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
         operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)

@@ -8,15 +8,16 @@ or in order.
 
 from __future__ import annotations
 
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, savemat
 
 from agent.contract.arrays import Array, read_only, shape_text
 from agent.contract.errors import InputError, counted
+from agent.contract.extras import needing
 from agent.contract.files import read_bytes, writing_whole
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
@@ -27,9 +28,10 @@ SUFFIXES = (".npz", ".mat")
 
 def load(path: Path, problem: Problem) -> tuple[LinkMatrices, LinkMatrices]:
     """K and H of a .npz or .mat file. Raises InputError: one sentence for what is not there, or does not fit."""
-    data = BytesIO(read_bytes(path, kind="gains file"))
+    data, is_mat = BytesIO(read_bytes(path, kind="gains file")), path.suffix == ".mat"
+    read = _scipy_io().loadmat if is_mat else partial(np.load, allow_pickle=False)
     try:
-        content: dict[str, Any] = loadmat(data) if path.suffix == ".mat" else dict(np.load(data, allow_pickle=False))
+        content: dict[str, Any] = dict(read(data))
     except NotImplementedError:
         raise InputError(f'{path} is in the format of MATLAB 7.3; write it with save(..., "-v7")') from None
     except Exception as error:  # what is no such file breaks its reader in many ways
@@ -41,6 +43,12 @@ def load(path: Path, problem: Problem) -> tuple[LinkMatrices, LinkMatrices]:
         return unstacked(problem, *(_by_mode(content[letter], path.suffix) for letter in ("K", "H")))
     except ValueError as error:
         raise InputError(f"{path} does not fit {problem.name}: {error}") from None
+
+
+def _scipy_io() -> Any:
+    with needing("a .mat file"):
+        from scipy import io
+    return io
 
 
 def _by_mode(value: Any, suffix: str) -> list[Any]:
@@ -128,11 +136,12 @@ def stacked(problem: Problem, of_K: LinkMatrices, of_H: LinkMatrices) -> tuple[A
 def save(gains: Gains, path: Path, *, to: str, force: bool) -> dict[str, Any]:
     """Write K, H and the names, as "npz" or "mat"; returns what to print."""
     problem, (K, H) = gains.problem, stacked(gains.problem, gains.K, gains.H)
+    matlab = _scipy_io() if to == "mat" else None
     with writing_whole(path, force=force) as part, part.open("wb") as file:
-        if to == "npz":
+        if matlab is None:
             np.savez(file, K=K, H=H, node_names=np.array(problem.node_names), mode_names=np.array(problem.mode_names))
         else:
             cells = {"node_names": [problem.node_names], "mode_names": [problem.mode_names]}
             names = {key: np.array(value, dtype=object) for key, value in cells.items()}
-            savemat(file, {"K": np.moveaxis(K, 0, -1), "H": np.moveaxis(H, 0, -1), **names})
+            matlab.savemat(file, {"K": np.moveaxis(K, 0, -1), "H": np.moveaxis(H, 0, -1), **names})
     return {"problem": problem.name, "modes": len(K), "K": K.shape[1:], "H": H.shape[1:], "output": str(path)}

@@ -17,6 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from agent.contract.errors import InputError, RunBroken
+from agent.contract.extras import needing
 
 PATIENCE = 30  # seconds for a Dask scheduler to answer, and for the first of its workers to be there
 
@@ -48,12 +49,8 @@ def each(
 
 def greet_cluster(address: str) -> None:
     """InputError where no Dask scheduler answers at this address, or the package to ask it with is missing."""
-    try:
+    with needing("a Dask cluster"):
         import distributed  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "a Dask cluster needs the package distributed, which is not installed; pip install 'peakmesh[dask]'"
-        ) from None
     try:
         with ThreadPoolExecutor(1) as thread:  # this one may have an event loop already, as notebooks do
             thread.submit(asyncio.run, _greet(address)).result()

@@ -111,8 +111,7 @@ DOORS = {
         "designer/decay.py",
         "designer/lmi/",
         "designer/gain/products.py",
-        "designer/proof/float_model.py",
-        "designer/proof/machine.py",
+        "designer/proof/sparse.py",
         "designer/identify/fit.py",
         "designer/export/matlab.py",
         "designer/stacked.py",
@@ -154,7 +153,8 @@ LAZY = [
     "designer/__main__.py", "designer/library/peakmesh/__init__.py",
 ]  # fmt: skip
 LIGHT = [
-    "agent.cli", "agent.commands", "agent.plan", "agent.signals", "agent.contract.errors", "agent.contract.files",
+    "agent.cli", "agent.commands", "agent.plan", "agent.signals", "agent.contract.errors", "agent.contract.extras",
+    "agent.contract.files",
     "designer.cli", "designer.commands",
 ]  # fmt: skip
 

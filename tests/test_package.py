@@ -11,10 +11,13 @@ from importlib.metadata import packages_distributions
 
 from places import ROOT
 
+from agent.contract.extras import EXTRAS
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 VERSIONS = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]))
 OURS = {"agent", "designer"}  # in which the library stands, too
 NOT_REQUIRED = {"pytest"}  # who has it loads the plugin
+USED = sorted(set(EXTRAS.values()))  # by the package itself; the others are for those who work on it
 OPTIONAL = {"scs"}  # asked where it is installed; cvxpy brings it
 
 
@@ -32,7 +35,7 @@ def outside(source: str) -> set[str]:
 def undeclared(imports: Iterable[str]) -> set[str]:
     """What no requirement brings."""
     extras = PROJECT["project"]["optional-dependencies"]
-    requirements = [*PROJECT["project"]["dependencies"], *extras["dask"], *extras["parquet"], *extras["foxglove"]]
+    requirements = [*PROJECT["project"]["dependencies"], *(line for extra in USED for line in extras[extra])]
     declared = {re.split("[<>=]", requirement)[0] for requirement in requirements}
     provided = packages_distributions()
     return {name for name in imports if not declared & {found.lower() for found in provided.get(name, [])}} - OPTIONAL

@@ -88,6 +88,6 @@ def test_it_shows_the_commands_of_a_whole_run() -> None:
 
 def test_ci_runs_its_test_command() -> None:
     """`.ci/run` takes the test command from here, `.ci/package` the one that installs; there is one of each."""
-    for where, command in ((".ci/run", "bin/pytest"), (".ci/package", "bin/pip install --quiet . ")):
+    for where, command in ((".ci/run", "bin/pytest"), (".ci/package", "bin/pip install --quiet '")):
         assert len([line for line in README.splitlines() if command in line]) == 1
         assert f"'{command.partition(' --')[0]}" in (ROOT / where).read_text()

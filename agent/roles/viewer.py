@@ -14,6 +14,7 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 from agent.contract.errors import InputError
+from agent.contract.extras import needing
 from agent.contract.gains import Gains
 from agent.contract.keys import COORDINATOR, EVENT, VIEWER, data_topics, model_of
 from agent.network.configuration import Network
@@ -52,10 +53,8 @@ def _pass_on(overheard: Channel, show: Callable[[str, bytes], None]) -> None:
 @contextmanager
 def _server(gains: Gains, run: str, host: str, port: int) -> Iterator[tuple[str, Callable[[str, bytes], None]]]:
     """Foxglove's server with a channel for each topic of the run: its address, and what takes the messages."""
-    try:
+    with needing("live"):
         import foxglove
-    except ImportError:
-        raise InputError("live needs Foxglove's SDK: pip install 'peakmesh[foxglove]'") from None
     context = foxglove.Context()
     channels = {topic: _channel(foxglove, topic, context) for topic in (*data_topics(gains.problem), EVENT)}
     try:

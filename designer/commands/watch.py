@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from agent.commands.looking import add_looker, look_on
@@ -113,16 +114,22 @@ def _learn(onlooker: Onlooker, scene: Scene, digest: str) -> None:
 @contextmanager
 def _showing(options: argparse.Namespace) -> Iterator[Show]:
     """What takes a state and shows it: a terminal's screen, lines, or JSON."""
-    if options.json or not sys.stdout.isatty() or options.once:
-        yield _print_json() if options.json else _print_lines(options.once)
-        return
-    from rich.console import Console
-    from rich.live import Live
+    to_look_at = not options.json and (options.once or sys.stdout.isatty())
+    if to_look_at and not find_spec("rich"):
+        print("lines, for a table needs rich: pip install 'peakmesh[design]'", file=sys.stderr)
+        to_look_at = False
+    if not to_look_at:
+        yield _print_json() if options.json else _print_lines()
+    elif options.once:
+        yield _print_table
+    else:
+        from rich.console import Console
+        from rich.live import Live
 
-    from designer.watch.table import table
+        from designer.watch.table import table
 
-    with Live(console=Console(), auto_refresh=False, vertical_overflow="crop") as live:
-        yield lambda seen, is_all: live.update(table(seen), refresh=True)
+        with Live(console=Console(), auto_refresh=False, vertical_overflow="crop") as live:
+            yield lambda seen, is_all: live.update(table(seen), refresh=True)
 
 
 def _print_json() -> Show:
@@ -141,19 +148,24 @@ def _print_json() -> Show:
     return show
 
 
-def _print_lines(once: bool) -> Show:
-    """The table as it is, or a line a second."""
+def _print_table(seen: Seen, is_all: bool) -> None:
+    """As it is, once."""
     from rich.console import Console
 
-    from designer.watch.table import lines, table
+    from designer.watch.table import table
+
+    Console(width=None if sys.stdout.isatty() else 120).print(table(seen))
+
+
+def _print_lines() -> Show:
+    """A line a second."""
+    from designer.watch.lines import lines
 
     last, due = -1, 0.0
 
     def show(seen: Seen, is_all: bool) -> None:
         nonlocal last, due
-        if once:
-            Console(width=None if sys.stdout.isatty() else 120).print(table(seen))
-        elif is_all or time.monotonic() >= due:
+        if is_all or time.monotonic() >= due:
             due = time.monotonic() + LINE_SECONDS
             print("\n".join(lines(seen, after=last)), flush=True)
             last = max([last, *(told.number for told in seen.events)])

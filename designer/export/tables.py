@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError
+from agent.contract.extras import needing
 from agent.contract.files import writing_whole
 from designer.export.columns import Column, columns
 from designer.replay.log import Log
@@ -40,11 +40,9 @@ def write_csv(log: Log, output: Path, *, wide: bool, force: bool) -> int:
 
 def write_parquet(log: Log, output: Path, *, wide: bool, force: bool) -> int:
     """The same tables; node, field and mode_name as dictionaries. Returns the rows."""
-    try:
+    with needing("--parquet"):
         import pyarrow as pa
         import pyarrow.parquet as pq
-    except ImportError:
-        raise InputError("--parquet needs pyarrow: pip install 'peakmesh[parquet]'") from None
     parts = list(columns(log))
     word = pa.dictionary(pa.int32(), pa.string())
     whose, fields = _dictionary(column.whose for column in parts), _dictionary(column.field for column in parts)

@@ -70,7 +70,10 @@ def _groups(filled: NDArray[np.bool_]) -> list[Group]:
     everything = [Group(slice(None), slice(None))]
     if len(filled) <= _SMALL or filled.mean() > _SPARSE:
         return everything
-    from scipy import sparse  # takes 0.2 s to import
+    try:
+        from scipy import sparse  # takes 0.2 s to import
+    except ModuleNotFoundError:
+        return everything
 
     wide = filled.mean(axis=1) > _WIDE
     narrow = np.flatnonzero(~wide)

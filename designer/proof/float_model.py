@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from flint import arb
 from numpy.typing import NDArray
-from scipy import sparse
 
 from agent.contract.arrays import Array
 from designer.decay import Decay, decay, invariants
 from designer.proof.ball_model import BallModel
 from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
+from designer.proof.sparse import matrix
 
 Indices = NDArray[np.int64]
 
@@ -161,11 +161,11 @@ class _Entries:
         self._parts.append((*places, numbers.middle[kept], numbers.size[kept]))
 
     def matrix(self, shape: tuple[int, int]) -> Enclosed:
-        """Two CSR matrices."""
-        if not self._parts:
-            return Enclosed(*2 * [sparse.csr_array(shape)])
-        rows, columns, *numbers = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
-        found = Enclosed(*(sparse.csr_array((part, (rows, columns)), shape=shape) for part in numbers))
+        """Two sparse matrices."""
+        nowhere, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+        parts = self._parts or [(nowhere, nowhere, nothing, nothing)]
+        rows, columns, *numbers = (np.concatenate(each) for each in zip(*parts, strict=True))
+        found = Enclosed(*(matrix(part, rows, columns, shape) for part in numbers))
         assert found.size.nnz == len(rows), "a place twice: its sum would be rounded, and not counted"
         return found
 

@@ -1,4 +1,4 @@
-"""What is seen of a run, for a terminal, and for a log."""
+"""What is seen of a run, for a terminal; with rich, which an install for a board does not have."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from designer.watch.lines import ledger, number, substituted, where, word
 from designer.watch.scene import NodeSeen, Seen
 
 SHOWN = 8  # events that a terminal shows
@@ -25,43 +26,20 @@ def table(seen: Seen) -> RenderableType:
     return Group(_head(seen), Text(), _Nodes(seen), Text(), *_events(seen))
 
 
-def lines(seen: Seen, *, after: int = -1) -> Iterator[str]:
-    """Events with a number beyond `after`, and where the run is: for who reads it in a file."""
-    for told in seen.events:
-        if told.number > after:
-            yield f"  step {told.step}  {told.kind}: {told.text}"
-    there = [node for node in seen.nodes if node.there]
-    largest = max((node.error for node in seen.nodes if node.error is not None), default=None)
-    words = [
-        _where(seen),
-        f"{_number(seen.steps_per_second, '.1f')} steps/s",
-        f"{len(there)} of {len(seen.nodes)} nodes",
-        _substituted(seen),
-        f"error at most {_number(largest, '.3g')}",
-        _ledger(seen),
-    ]
-    yield "; ".join(filter(None, words))
-
-
 def _head(seen: Seen) -> Text:
     kind = "" if seen.period is None else "lock-step" if not seen.period else f"paced, {1e3 * seen.period:g} ms"
     facts = [f"run {seen.run}", kind, "" if seen.seed is None else f"seed {seen.seed}"]
     rates = [
-        _where(seen),
-        f"{_number(seen.steps_per_second, '.1f')} steps/s",
-        f"{_number(seen.messages_per_second, '.0f')} messages/s",
-        f"watched since step {_word(seen.watched_since)}",
+        where(seen),
+        f"{number(seen.steps_per_second, '.1f')} steps/s",
+        f"{number(seen.messages_per_second, '.0f')} messages/s",
+        f"watched since step {word(seen.watched_since)}",
     ]
     text = Text()
     text.append("   ".join(filter(None, facts)), style="bold").append("\n" + "   ".join(rates))
-    text.append(f"\n{_ledger(seen)}", style=COLOURS[seen.ledger["status"] if seen.ledger else "none"])
-    below = _substituted(seen), f"gone: {', '.join(seen.gone)}" if seen.gone else ""
+    text.append(f"\n{ledger(seen)}", style=COLOURS[seen.ledger["status"] if seen.ledger else "none"])
+    below = substituted(seen), f"gone: {', '.join(seen.gone)}" if seen.gone else ""
     return text.append("\n" + "; ".join(filter(None, below)))
-
-
-def _where(seen: Seen) -> str:
-    of = "" if seen.steps is None else f" of {seen.steps}"
-    return f"step {_word(seen.step)}{of}, mode {_word(seen.mode)}"
 
 
 class _Column(NamedTuple):
@@ -104,7 +82,7 @@ def _is_behind(node: NodeSeen, seen: Seen) -> bool:
 def _step(node: NodeSeen, seen: Seen) -> Text:
     if not node.there:
         return Text("gone" if node.step is None else f"gone at {node.step}", style="red")
-    return Text(_word(node.step), style="yellow" if _is_behind(node, seen) else "")
+    return Text(word(node.step), style="yellow" if _is_behind(node, seen) else "")
 
 
 def _heard(node: NodeSeen, seen: Seen) -> Text:
@@ -137,9 +115,9 @@ COLUMNS = (
     ),
     _Column("heard", _heard, "left"),
     _Column("measured", _measured, "left"),
-    _Column("innovation", lambda node, seen: Text(_number(node.innovation, ".3g"))),
-    _Column("error", lambda node, seen: Text(_number(node.error, ".3g"))),
-    _Column("error\nmost", lambda node, seen: Text(_number(node.largest_error, ".3g")), from_width=90),
+    _Column("innovation", lambda node, seen: Text(number(node.innovation, ".3g"))),
+    _Column("error", lambda node, seen: Text(number(node.error, ".3g"))),
+    _Column("error\nmost", lambda node, seen: Text(number(node.largest_error, ".3g")), from_width=90),
     _Column("substituted\npairs + y", _missed),
 )
 
@@ -152,28 +130,3 @@ def _events(seen: Seen) -> Iterator[RenderableType]:
         yield line.append(f"  {told.text}")
     if seen.ended is not None:
         yield Text(f"the run has ended: {seen.ended}", style="bold")
-
-
-def _ledger(seen: Seen) -> str:
-    if seen.ledger is None:
-        return "ledger not known yet"
-    if "step" not in seen.ledger:
-        return f"ledger {seen.ledger['text']}"
-    since = f", seen from step {seen.ledger['since']} on" if seen.ledger["since"] else ""
-    return f"ledger at step {seen.ledger['step']}{since}: {seen.ledger['text']}"
-
-
-def _substituted(seen: Seen) -> str:
-    if seen.period is not None and not seen.period:
-        return ""  # nothing is, in lock-step
-    why = ", ".join(f"{count} {kind}" for kind, count in seen.reasons.items())
-    missed = f"substituted {seen.pairs_substituted} pairs, {seen.measurements_substituted} measurements"
-    return f"{missed}; events name {why}" if why else missed
-
-
-def _word(value: object) -> str:
-    return "?" if value is None else str(value)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "?" if value is None else f"{value:{form}}"

@@ -12,7 +12,7 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer import decay as module
 from designer.analysis import GivenGains, analyse
-from designer.decay import decay, spectral_radius
+from designer.decay import decay, lasting, spectral_radius
 from designer.gain.exact import Operator, exact_gain
 from designer.model.error_model import error_model, stacked_links
 from designer.proof.by_balls import ByBalls
@@ -108,6 +108,20 @@ def test_the_radius_is_that_of_the_eigenvalues(large: bool, monkeypatch: pytest.
     expected = float(np.abs(np.linalg.eigvals(module._matrix(operator.corner, 1, 5))).max())
     assert spectral_radius(operator.corner, 1, 5) == pytest.approx(expected, rel=1e-9)
     assert expected == pytest.approx(0.81, rel=1e-9)
+
+
+def test_without_scipy_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The radius, and what lasts."""
+    operator = operator_of(chain([0.9, 0.3, -0.5, 0.7, 0.2]))
+    monkeypatch.setattr(module, "_FEW", 0)
+    found = []
+    for has_scipy in (True, False):
+        monkeypatch.setattr(module, "find_spec", {"scipy": has_scipy}.get)
+        lasts = lasting(operator.corner, np.ones((1, 5, 5)))
+        assert lasts is not None
+        X, growth = lasts
+        found.append([spectral_radius(operator.corner, 1, 5), growth, *(X / X.trace(axis1=1, axis2=2)).ravel()])
+    assert found[1] == pytest.approx(found[0], rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("radius", [0.9, 0.9999, 1.001])

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agent.contract.extras import needing
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer import problems
@@ -30,6 +31,7 @@ def find(problem: Problem | Name) -> Problem:
     return problem if isinstance(problem, Problem) else problems.find(str(problem))
 
 
+@needing("design")
 def design(
     problem: Problem | Name,
     *,
@@ -50,6 +52,7 @@ def design(
     return synthesis.design(find(problem), method=method, peak_slack=peak_slack, progress=progress, **spent)
 
 
+@needing("analyse")
 def analyse(problem: Problem | Name, gains: Gains | Name | tuple[Links, Links]) -> Analysis:
     """What gains do on a problem, whoever made them (`peakmesh analyse`); (K, H) are those of eq. (5) by mode and link.
 
@@ -121,6 +124,7 @@ def load(*recordings: Name, run: str | None = None, gains: Name | None = None) -
     return load(_paths(recordings), run=run, gains=None if gains is None else Path(gains))
 
 
+@needing("figures")
 def figures(*recordings: Name, width: float = 7.16, run: str | None = None) -> dict[str, Figure]:
     """The figures of `peakmesh report --figures`, by name, `width` inches wide; they are the caller's to change."""
     from designer.report import figures

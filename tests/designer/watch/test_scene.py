@@ -19,8 +19,9 @@ from agent.contract import keys
 from agent.contract.gains import Gains
 from agent.contract.messages import Control, Message
 from designer.watch import scene as module
+from designer.watch.lines import lines
 from designer.watch.scene import Scene, Seen
-from designer.watch.table import lines, table
+from designer.watch.table import table
 
 GAINS = Gains.load(ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json")
 NAMES = GAINS.problem.node_names
