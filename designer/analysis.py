@@ -31,6 +31,8 @@ from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
 from designer.ladder import Ladder, interval
+from designer.lmi import beyond_paper
+from designer.lmi.multipliers import least_of_lmi
 from designer.model.error_model import error_model, stacked_links
 from designer.proof.prover import Prover
 from designer.search.exact_design import certify, confirmed, lower_end
@@ -140,7 +142,8 @@ class Analysis(NamedTuple):
         lines += [
             f"stable     mean-square, {'proved' if self.stable else 'as far as floats tell'}; computed: each step "
             f"multiplies E|error|^2 by {self.radius:.6g} in the long run",
-            f"exact gain between {interval(low, high)}, {how}: {_steps(self.horizon)} show that it is no less",
+            f"exact gain between {interval(low, high)}, {how}: "
+            f"{_steps(self.horizon)} {'shows' if self.horizon == 1 else 'show'} that it is no less",
             f"ladder     {rungs}",
             *([] if self.robust is None else self.robust.lines()),
             *(f"radius     {radius.line()}" for radius in self.radii),
@@ -239,7 +242,11 @@ def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radi
         stable=verdict.holds or Prover(problem, given.K, given.H).stable.holds,
         radius=gain.radius,
         horizon=gain.horizon,
-        ladder=ladder._replace(gamma=verdict.gamma if verdict.holds else None),
+        ladder=ladder._replace(
+            gamma=verdict.gamma if verdict.holds else None,
+            lmi="the LMI" if beyond_paper(problem) else "Theorem 2",
+            theorem2_least=least_of_lmi(problem),
+        ),
         mode=problem.mode_names[policy.mode],
         steps=len(policy.Gamma) + 1,
         u=policy.u * (-1.0 if policy.u[np.abs(policy.u).argmax()] < 0.0 else 1.0),

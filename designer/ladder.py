@@ -18,6 +18,7 @@ from agent.contract.gains import Gains
 from designer.lmi import beyond_paper
 
 FLOOR, EXACT, CERTIFIED = "floor", "exact gain of these gains", "gamma, certified"
+THEOREM1, LEAST = "what Theorem 1 certifies of these gains", "proved: no gains have less by"
 FOUND_IN_BOX, PROVED_IN_BOX = "exact gain of the worst model found in the box", "proved for every model in the box"
 _NOTHING = 1e-6  # a floor this small beside the gain says nothing
 
@@ -34,11 +35,12 @@ class Ladder(NamedTuple):
     theorem1: float | None = None  # certified for these gains too, where gamma is less
     found_in_box: float | None = None  # what these gains have in the worst model of a box that was found
     proved_in_box: float | None = None  # gamma for every model of it
+    theorem2_least: float | None = None  # proved: no gains have less by Theorem 2
 
     @property
     def against_theorem2(self) -> float | None:
-        """The exact gain relative to Theorem 2's bound: -0.295 is 29.5 % below it."""
-        return None if self.exact is None or self.theorem2 is None else self.exact[1] / self.theorem2 - 1.0
+        """gamma relative to the least that Theorem 2 can give: -0.295 is 29.5 % below it. Both are proved, or None."""
+        return None if self.gamma is None or self.theorem2_least is None else self.gamma / self.theorem2_least - 1.0
 
     @property
     def above_floor(self) -> float | None:
@@ -59,12 +61,18 @@ class Ladder(NamedTuple):
             (EXACT, self.exact and self.exact[1]),
             (CERTIFIED, self.gamma),
             (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
-            (f"{self.lmi}'s bound", self.theorem2),
-            ("what Theorem 1 certifies of these gains", self.theorem1),
+            (self.least_of_lmi, self.theorem2_least),
+            (f"{self.lmi}'s bound, as a solver gave it", self.theorem2),
+            (THEOREM1, self.theorem1),
             (FOUND_IN_BOX, self.found_in_box),
             (PROVED_IN_BOX, self.proved_in_box),
         ]
         return [(name, value) for name, value in rungs if value is not None]
+
+    @property
+    def least_of_lmi(self) -> str:
+        """What the rung is called that no gains are below by the LMI."""
+        return f"{LEAST} {self.lmi}"
 
     def table(self, problem: str, kind: str) -> str:
         """The rungs as `as_table` writes them, under the name of the problem."""
@@ -76,10 +84,10 @@ class Ladder(NamedTuple):
         """A line for each rung, the lowest first."""
         remarks = []
         if self.against_theorem2 is not None:
-            remarks.append(f"{percent(self.against_theorem2)} against {self.lmi}'s bound")
+            remarks.append(f"{percent(self.against_theorem2)} against all that {self.lmi} can give")
         if self.above_floor is not None:
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
-        remarked = {CERTIFIED if self.exact is None else EXACT: ": ".join(["", ", ".join(remarks)] if remarks else [])}
+        remarked = {EXACT if self.gamma is None else CERTIFIED: f": {', '.join(remarks)}" if remarks else ""}
         texts = [(rung_text(name, value), name + remarked.get(name, "")) for name, value in self.rungs()]
         width = max((len(value) for value, _ in texts), default=0)
         lines = [f"{value:{width}}  {name}" for value, name in texts]
@@ -117,8 +125,9 @@ def _in_latex(text: str) -> str:
 
 
 def rung_text(name: str, value: float) -> str:
-    """A rung's value: rounded up, but for the floor, which is a bound from below."""
-    return f"{value:.6f}" if name == FLOOR or not value else rounded_up(value)
+    """A rung's value: rounded up, but for the bounds from below, which are rounded down."""
+    below = name == FLOOR or name.startswith(LEAST)
+    return rounded_down(value) if below else rounded_up(value)
 
 
 def ladder_of(gains: Gains) -> Ladder:
@@ -127,12 +136,18 @@ def ladder_of(gains: Gains) -> Ladder:
     gamma = proved.gamma if proved.holds else None
     lmi = "the LMI" if beyond_paper(gains.problem) else "Theorem 2"
     theorem1 = proved.theorem1_gamma if proved.holds else None
-    return Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi, theorem1)
+    rungs = Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi, theorem1)
+    return rungs._replace(theorem2_least=proved.lmi_least)
 
 
 def rounded_up(bound: float) -> str:
     """Six decimals, of a small number four digits; never below the bound, because less than what is proved is not."""
     return _rounded(bound, ROUND_CEILING, digits=4)
+
+
+def rounded_down(bound: float) -> str:
+    """The same for a bound from below."""
+    return _rounded(bound, ROUND_FLOOR, digits=4)
 
 
 def interval(low: float, high: float) -> str:

@@ -13,7 +13,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
-from designer.ladder import as_table, rounded_up
+from designer.ladder import as_table, rounded_down, rounded_up
 from designer.model.error_model import StackedGains, error_model
 from designer.problems import find
 from designer.search.starts import consensus_gains, least_variance_gains
@@ -46,6 +46,12 @@ class Computed:
         from designer.lmi import theorem2
 
         return theorem2.gamma_by_scs(self.problem, iterations=_SCS_ITERATIONS)
+
+    @cached_property
+    def least(self) -> float | None:
+        from designer.lmi.multipliers import least_of_lmi
+
+        return least_of_lmi(self.problem)
 
     @cached_property
     def consensus(self) -> float | None:
@@ -83,6 +89,7 @@ ROWS = (
     Row("clarabel", "LMI (36)(37) as printed, by Clarabel", lambda computed: computed.theorem2.certificate.lmi_gamma),
     Row("scs", f"the same by SCS, {_SCS_ITERATIONS} iterations at most", lambda computed: computed.scs),
     Row("decomposed", "the same optimum node by node", lambda computed: computed.decomposed.certificate.lmi_gamma),
+    Row("least", "proved: no point of (42) is below", lambda computed: computed.least),
     Row(
         "certified",
         "Theorem 2's gains: certified by Theorem 1",
@@ -136,7 +143,7 @@ class Reproduced(NamedTuple):
             return {"consensus": "not stable", "least_variance": "not stable", "scs": "no answer"}.get(key, "-")
         if key in ("certified", "exact"):
             return rounded_up(value)
-        return f"{value:g}" if key == "printed" else f"{value:.6f}"
+        return f"{value:g}" if key == "printed" else rounded_down(value) if key == "least" else f"{value:.6f}"
 
     def remarks(self) -> list[str]:
         """What the computed values say of the printed ones, for each example that has both."""
@@ -146,15 +153,20 @@ class Reproduced(NamedTuple):
             printed, optimum, scs = values.get("printed"), values.get("clarabel"), values.get("scs")
             if printed is None or optimum is None:
                 continue
-            off = 100.0 * abs(printed / optimum - 1.0)
+            least, off = values.get("least"), 100.0 * abs(printed / optimum - 1.0)
             agree = ""
             if scs is not None:
                 agree = f", on which two solvers agree within {100.0 * abs(scs / optimum - 1.0):.2f} %"
             if printed < optimum:
+                cannot = "As far as solvers tell, it cannot come from (42) with the printed data"
+                if least is not None and least > printed:
+                    cannot = (
+                        f"That it cannot come from (42) with the printed data is proved: no point of (42) has less "
+                        f"than {rounded_down(least)}"
+                    )
                 said.append(
                     f"Example {number}: the printed {printed:g} is {off:.1f} % below the optimum of the convex problem "
-                    f"(42){agree}. As far as solvers tell, it cannot come from (42) with the printed data; a misprint "
-                    "is likely, which one we do not know."
+                    f"(42){agree}. {cannot}; a misprint is likely, which one we do not know."
                 )
                 found = [value for key in _FOUND if (value := values.get(key)) is not None]
                 if found and min(found) > printed:

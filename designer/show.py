@@ -186,6 +186,7 @@ def _gains(gains: Gains) -> dict[str, Any]:
         "holds": proved.holds,
         "verified": proved.verified,
         "lmi_gamma": proved.lmi_gamma,
+        "lmi_least": proved.lmi_least,
         "exact": None if proved.exact is None else list(proved.exact),
         "floor": proved.floor,
         "solver": f"{solver.name} {solver.version}: {solver.status}, {solver.iterations} iterations",
@@ -204,13 +205,16 @@ def _as_claim(facts: dict[str, Any]) -> dict[str, Any]:
         shown["gamma"] = f'claimed {facts["gamma"]}, by design; "peakmesh {command}" checks it'
     if facts.get("theorem1_gamma") is not None:
         shown["theorem1_gamma"] = f"claimed {facts['theorem1_gamma']:.6g}"
-    if facts.get("lmi_gamma") is not None:
-        shown["lmi_gamma"] = f"claimed {facts['lmi_gamma']:.6g}"
+    for name in ("lmi_gamma", "lmi_least"):
+        if facts.get(name) is not None:
+            shown[name] = f"claimed {facts[name]:.6g}"
     if facts.get("exact"):
         shown["exact"] = "claimed between {:.6g} and {:.6g}".format(*facts["exact"])
     if facts.get("floor") is not None:
         shown["floor"] = f"claimed {facts['floor']:.6g}"
-    absent = {name for name in ("theorem1_gamma", "lmi_gamma", "exact", "floor") if facts.get(name) is None}
+    absent = {
+        name for name in ("theorem1_gamma", "lmi_gamma", "lmi_least", "exact", "floor") if facts.get(name) is None
+    }
     return {name: value for name, value in shown.items() if name not in {"holds", "verified", "is_another", *absent}}
 
 

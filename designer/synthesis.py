@@ -70,8 +70,15 @@ def design(
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:
         raise explained(problem, error, _solvable) from None
-    certificate = gains.certificate.model_copy(update={"floor": floor(problem)})
+    certificate = gains.certificate.model_copy(update={"floor": floor(problem), "lmi_least": _least_of_lmi(gains)})
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
+
+
+def _least_of_lmi(gains: Gains) -> float | None:
+    """Where an LMI is what the gains come from or what they are compared with."""
+    from designer.lmi.multipliers import least_of_lmi  # scipy takes long to import
+
+    return None if gains.certificate.lmi_gamma is None else least_of_lmi(gains.problem)
 
 
 def _exact_in_natural_units(

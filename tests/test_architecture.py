@@ -60,7 +60,7 @@ ROOMS = {
     "designer.stacked": "designer.model",
     "designer.box": "designer.decay designer.gain designer.model designer.proof",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
-    "designer.model designer.proof designer.search designer.stacked",
+    "designer.lmi designer.model designer.proof designer.search designer.stacked",
     "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "

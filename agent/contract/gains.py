@@ -51,6 +51,7 @@ class Certificate(Model):
     P: dict[str, Matrix] | None = None  # full: P[mode]
     horizon: int | None = Field(default=None, strict=True)  # kind "exact": the proof needs no more steps than this
     lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
+    lmi_least: Number | None = None  # proved: no gains have less by an LMI of this form
     lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
     floor: Number | None = None

@@ -138,7 +138,7 @@ def _whose(gains: Gains, differs: list[str]) -> list[str]:
 
 def _claimed(gains: Gains, low: float | None) -> list[str]:
     """What stands in the file too, and is not proved here."""
-    beside = ("floor", "lmi_gamma", "lmi_exact", *(("exact",) if low is None else ()))
+    beside = ("floor", "lmi_gamma", "lmi_least", "lmi_exact", *(("exact",) if low is None else ()))
     there = [name for name in beside if getattr(gains.certificate, name) is not None]
     found = [f"{listed(there)}: computed by whoever designed the gains"] if there else []
     if gains.worst_case is not None:

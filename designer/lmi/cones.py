@@ -25,6 +25,24 @@ class Cones(NamedTuple):
     b: Array
     orders: list[int]
 
+    def piece(self, z: Array, number: int) -> Array:
+        """The matrix of one inequality, (order, order), out of a vector like b."""
+        sizes = [order * (order + 1) // 2 for order in self.orders]
+        first, order = sum(sizes[:number]), self.orders[number]
+        return _matrix(z[first : first + sizes[number]], order)
+
+    def without(self, dropped: dict[int, Indices]) -> Cones:
+        """With rows and columns left out of the inequalities of these numbers."""
+        kept, orders = [], []
+        for number, order in enumerate(self.orders):
+            left = np.ones(order, dtype=bool)
+            left[dropped.get(number, [])] = False
+            columns, rows = np.tril_indices(order)
+            kept.append(left[rows] & left[columns])
+            orders.append(int(left.sum()))
+        at = np.concatenate(kept)
+        return Cones(scipy.sparse.csc_matrix(self.A.tocsr()[at]), self.b[at], orders)
+
 
 class Assembly:
     """Hands out unknowns and inequalities; `cones` puts the inequalities together."""
@@ -46,7 +64,7 @@ class Assembly:
 
     def inequality(self) -> Inequality:
         """A new inequality, of order 0 until rows are appended to it."""
-        self._inequalities.append(Inequality())
+        self._inequalities.append(Inequality(len(self._inequalities)))
         return self._inequalities[-1]
 
     def cones(self) -> Cones:
@@ -73,7 +91,8 @@ class Inequality:
     that stands on the diagonal is added whole.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, number: int = 0) -> None:
+        self.number = number  # counted from the first of its assembly
         self.order = 0
         self.terms: list[tuple[Indices, Indices, Array]] = []  # places in the triangle, unknowns, coefficients
         self.numbers: list[tuple[Indices, Array]] = []  # places in the triangle, numbers
@@ -116,10 +135,7 @@ class Inequality:
             np.add.at(upper, at, number)
         for at, unknown, coefficient in self.terms:
             np.add.at(upper, at, coefficient * u[unknown])
-        columns, rows = np.tril_indices(self.order)
-        matrix = np.zeros((self.order, self.order))
-        matrix[rows, columns] = matrix[columns, rows] = upper / np.where(rows < columns, math.sqrt(2.0), 1.0)
-        return matrix
+        return _matrix(upper, self.order)
 
     def _keep(self, rows: Indices, columns: Indices, values: Array, unknowns: Indices | None) -> None:
         upper = rows <= columns
@@ -129,6 +145,14 @@ class Inequality:
             self.numbers.append((at, values))
         else:
             self.terms.append((at, unknowns[upper], values))
+
+
+def _matrix(upper: Array, order: int) -> Array:
+    """The symmetric matrix of which this is the upper triangle, its off-diagonal entries times sqrt(2)."""
+    columns, rows = np.tril_indices(order)
+    matrix = np.zeros((order, order))
+    matrix[rows, columns] = matrix[columns, rows] = upper / np.where(rows < columns, math.sqrt(2.0), 1.0)
+    return matrix
 
 
 def _triangle(rows: Indices, columns: Indices) -> Indices:

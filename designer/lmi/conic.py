@@ -38,6 +38,7 @@ class Answer(NamedTuple):
 
     u: Array
     record: Solver
+    z: Array | None = None  # the multipliers of the cones, likewise their upper triangles; Clarabel's alone
 
 
 def clarabel(cones: Cones, q: Array) -> Answer:
@@ -62,6 +63,7 @@ def clarabel(cones: Cones, q: Array) -> Answer:
     return Answer(
         np.array(found.x),
         _record("CLARABEL", status, int(found.iterations), (float(found.r_prim), float(found.r_dual)), seconds),
+        np.array(found.z),
     )
 
 

@@ -146,14 +146,15 @@ def _run(
     lmi = assemble(rescaled(problem, units), margin=margin, error=units.error)
     q = np.zeros(lmi.cones.A.shape[1])
     q[lmi.delta] = 1.0
-    u, record = solver(lmi.cones, q)
+    u, record, _ = solver(lmi.cones, q)
     return record, _solution(problem, lmi, u, units, record) if record.status in SOLVED else None
 
 
-def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lmi:
+def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0, split: bool = True) -> Lmi:
     """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance.
 
-    Errors are measured in units `error` times as large as the state's: what x and w do to them is divided by it.
+    Without `split` the balance is one piece. Errors are measured in units `error` times as large as the state's: what
+    x and w do to them is divided by it.
     """
     build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
     delta, R = build.unknown(1, 1), build.symmetric(problem.plant_states)
@@ -168,7 +169,8 @@ def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lm
         links = [(i, j) for i in range(n) for j in heard[i]]
         X = {(i, j): build.unknown(nx, len(problem.nodes[j].C)) for i, j in links}
         Y = {(i, j): build.unknown(nx, nx) for i, j in links if i != j or not problem.unbiased}
-        balance = _balance(build, problem, columns, R, Q[s], heard, 1.0 - margin)
+        groups = heard if split else [tuple(range(n))]
+        balance = _balance(build, problem, columns, R, Q[s], groups, 1.0 - margin)
         home = [_home(balance, heard_i) for heard_i in heard]
         spared = {k: max((i for i in range(n) if home[i] == k), key=lambda i: len(heard[i])) for k in set(home)}
         mode = Mode(Q[s], X, Y, T={}, U={}, balance=balance, nodes=[], losses={}, links={}, peaks=[])

@@ -45,16 +45,19 @@ def test_slow_plants_are_known_to_take_longer() -> None:
 
 
 def test_the_distances() -> None:
-    """Of the exact gain, below Theorem 2's bound and above the floor."""
-    ladder = Ladder(floor=2.0, exact=(2.19, 2.2), gamma=2.2, theorem2_exact=(3.0, 3.1), theorem2=4.0)
+    """Of what is certified: below the least that Theorem 2 gives, which is proved too, and above the floor."""
+    ladder = Ladder(2.0, (2.19, 2.2), 2.2, (3.0, 3.1), 4.1, theorem2_least=4.0)
     assert (ladder.against_theorem2, ladder.above_floor) == (2.2 / 4.0 - 1.0, 2.2 / 2.0 - 1.0)
     assert ladder.lines() == [
         "2.000000  floor",
-        "2.200000  exact gain of these gains: -45.0 % against Theorem 2's bound, 10.0 % above the floor",
-        "2.200000  gamma, certified",
+        "2.200000  exact gain of these gains",
+        "2.200000  gamma, certified: -45.0 % against all that Theorem 2 can give, 10.0 % above the floor",
         "3.100000  exact gain of Theorem 2's gains",
-        "4.000000  Theorem 2's bound",
+        "4.000000  proved: no gains have less by Theorem 2",
+        "4.100000  Theorem 2's bound, as a solver gave it",
     ]
+    assert ladder._replace(theorem2_least=None).against_theorem2 is None  # a solver's word is compared with nothing
+    assert ladder._replace(gamma=None).against_theorem2 is None
 
 
 def test_both_of_a_designs_proved_gammas_are_rungs() -> None:
@@ -66,11 +69,12 @@ def test_both_of_a_designs_proved_gammas_are_rungs() -> None:
         "floor",
         "exact gain of these gains",
         "gamma, certified",
-        "Theorem 2's bound",
+        "proved",
+        "Theorem 2's bound, as a solver gave it",
         "what Theorem 1 certifies of these gains",
     ]
     assert lines[2].startswith(rounded_up(proved.gamma))
-    assert lines[4].startswith(rounded_up(proved.theorem1_gamma))
+    assert lines[5].startswith(rounded_up(proved.theorem1_gamma))
     assert [value for _, value in ladder_of(gains).rungs()] == sorted(value for _, value in ladder_of(gains).rungs())
 
 
@@ -88,20 +92,26 @@ def test_what_is_not_there_is_not_said() -> None:
 
 def test_numbers_of_different_length_stand_in_one_column() -> None:
     assert Ladder(0.0, (1.7e-4, 1.79884e-4), 1.8e-4, None, 0.2).lines()[1:] == [
-        "0.0001799  exact gain of these gains: -99.9 % against Theorem 2's bound",
+        "0.0001799  exact gain of these gains",
         "0.0001800  gamma, certified",
-        "0.200000   Theorem 2's bound",
+        "0.200000   Theorem 2's bound, as a solver gave it",
     ]
+
+
+def test_bounds_from_below_are_rounded_down() -> None:
+    lines = Ladder(1.0000019, None, 2.0, None, None, theorem2_least=1.2345678).lines()
+    assert (lines[0], lines[2]) == ("1.000001  floor", "1.234567  proved: no gains have less by Theorem 2")
 
 
 def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
     """The name of the LMI stands on every line that speaks of it."""
-    lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI").lines()
+    lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI", theorem2_least=4.0).lines()
     assert lines[1:] == [
-        "1.000000  exact gain of these gains: -75.0 % against the LMI's bound",
-        "1.000000  gamma, certified",
+        "1.000000  exact gain of these gains",
+        "1.000000  gamma, certified: -75.0 % against all that the LMI can give",
         "2.000000  exact gain of the LMI's gains",
-        "4.000000  the LMI's bound",
+        "4.000000  proved: no gains have less by the LMI",
+        "4.000000  the LMI's bound, as a solver gave it",
     ]
     document = find("two-nodes").document()
     gains = design(Problem.from_document(document | {"unbiased": True}), method="decomposed")
@@ -186,7 +196,7 @@ def test_a_table_for_a_paper_has_every_rung() -> None:
         r"floor & 0.000000 \\",
         r"exact gain of these gains & 0.123457 \\",
         r"gamma, certified & 0.200000 \\",
-        r"Theorem 2's bound & 0.333334 \\",
+        r"Theorem 2's bound, as a solver gave it & 0.333334 \\",
     ]
     assert lines[-2:] == [r"\bottomrule", r"\end{tabular}"]
 

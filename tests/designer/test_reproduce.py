@@ -6,7 +6,7 @@ import csv
 
 import pytest
 
-from designer.ladder import rounded_up
+from designer.ladder import rounded_down, rounded_up
 from designer.reproduce import EXAMPLES, PRINTED, ROWS, Reproduced, reproduce
 
 KEYS = [row.key for row in ROWS]
@@ -15,7 +15,7 @@ KEYS = [row.key for row in ROWS]
 @pytest.fixture(scope="module")
 def paper() -> Reproduced:
     """Both examples, without the rows that take long."""
-    return reproduce(rows=["printed", "clarabel", "decomposed", "certified", "theorem2_exact", "floor"])
+    return reproduce(rows=["printed", "clarabel", "least", "decomposed", "certified", "theorem2_exact", "floor"])
 
 
 def value(table: Reproduced, name: str, key: str) -> float:
@@ -28,7 +28,9 @@ def value(table: Reproduced, name: str, key: str) -> float:
 def test_the_ladder_holds(paper: Reproduced, name: str) -> None:
     """Floor <= exact gain of Theorem 2's gains <= their certified gamma, which is the optimum of the LMI."""
     floor, exact, certified = (value(paper, name, key) for key in ("floor", "theorem2_exact", "certified"))
+    least = value(paper, name, "least")
     assert floor <= exact <= certified
+    assert least <= certified <= least * (1.0 + 2e-4)
     assert certified == pytest.approx(value(paper, name, "clarabel"), rel=1e-4)
     assert value(paper, name, "decomposed") == pytest.approx(value(paper, name, "clarabel"), rel=1e-4)
 
@@ -39,9 +41,18 @@ def test_what_is_said_of_the_printed_values(paper: Reproduced) -> None:
     below, above = (PRINTED[name] / value(paper, name, "clarabel") - 1.0 for name in EXAMPLES)
     assert below < 0.0 < above
     assert f"{-100.0 * below:.1f} % below the optimum" in first
-    assert "cannot come from (42)" in first
+    assert f"is proved: no point of (42) has less than {rounded_down(value(paper, EXAMPLES[0], 'least'))}" in first
     assert f"{value(paper, EXAMPLES[0], 'theorem2_exact'):.4f}" in reached
     assert f"{100.0 * above:.1f} % above the optimum" in second
+
+
+def test_without_a_proof_solvers_have_the_word(paper: Reproduced) -> None:
+    """And of a printed value that is not below what is proved."""
+    values = paper.values[EXAMPLES[0]]
+    for least in (None, 0.2):
+        (said, _) = Reproduced({EXAMPLES[0]: values | {"least": least}}, {}).remarks()
+        assert "As far as solvers tell, it cannot come from (42)" in said
+        assert "proved" not in said
 
 
 def test_its_table_for_a_paper_is_the_one_that_is_printed() -> None:
