@@ -67,7 +67,8 @@ class Ladder(NamedTuple):
             (FOUND_IN_BOX, self.found_in_box),
             (PROVED_IN_BOX, self.proved_in_box),
         ]
-        return [(name, value) for name, value in rungs if value is not None]
+        there = [(name, value) for name, value in rungs if value is not None]
+        return sorted(there, key=lambda rung: (rung[0] != FLOOR, rung[1]))
 
     @property
     def least_of_lmi(self) -> str:
@@ -83,8 +84,8 @@ class Ladder(NamedTuple):
     def lines(self) -> list[str]:
         """A line for each rung, the lowest first."""
         remarks = []
-        if self.against_theorem2 is not None:
-            remarks.append(f"{percent(self.against_theorem2)} against all that {self.lmi} can give")
+        if self.against_theorem2 is not None and self.against_theorem2 < 0.0:
+            remarks.append(f"{-100.0 * self.against_theorem2:.1f} % below all that {self.lmi} can give")
         if self.above_floor is not None:
             remarks.append(f"{100.0 * self.above_floor:.1f} % above the floor")
         remarked = {EXACT if self.gamma is None else CERTIFIED: f": {', '.join(remarks)}" if remarks else ""}

@@ -10,7 +10,8 @@ what its best gains leave, Res_i(s), a Schur complement of moments, and the same
     U_R = sum_s [A B]V(s)[A B]' - V_xx(s),      U_i(t) = sum_s pi_st Res_i(s) - V_ii(t),
 
 all of them >= 0, sum_s tr V_ww(s) >= sum_it tr(Q_i(t) U_i(t)), and Q_i(t) >= M'M / gamma^2 by (18): hence gamma^2 >=
-sum_it tr(M U_i(t) M') / sum_s tr V_ww(s). Nothing is asked of where V comes from; docs/theory.md, section 6.
+sum_it tr(M U_i(t) M') / sum_s tr V_ww(s), with the weight of node i in M. Nothing is asked of where V comes from;
+docs/theory.md, section 6.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def _proved(problem: Problem, V: list[arb_mat], weighed: list[Indices]) -> float
             U = sum((Res * _ball(pi[s][t]) for s, Res in enumerate(residuals)), arb_mat(nx, nx)) - part(V_t, e_i, e_i)
             if np.isin(e_i, weighed[t]).any() and not _positive(U):  # else U is a sum of Res >= 0
                 return None
-            gained += _trace(M * U * M.transpose())
+            gained += _trace(M * U * M.transpose()) * arb(float(problem.weights[i])) ** 2
     for V_s in V:
         w = range(V_s.nrows() - nw, V_s.nrows())
         spent += _trace(part(V_s, w, w))

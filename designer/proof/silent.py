@@ -6,8 +6,9 @@ let w = W f cancel the mean of what each of them measures. Whatever the gains, x
 
     |W f|^2 >= (lambda^2 - 1) sum over S of |M f|^2 / gamma^2:
 
-the terms of R and of Q_j(s) are on the right side with factors >= 0. `designer.proof.least` weighs a family of matrices
-that has to be positive definite; where the best weights are on a line whose direction is no fraction, this is left.
+with the weights of nodes in M. The terms of R and of Q_j(s) are on the right side with factors >= 0. In
+`designer.proof.least` a family of matrices has to be positive definite; where the best weights are on a line whose
+direction is no fraction, this is left.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def _bounds(problem: Problem) -> Iterator[arb]:
                 continue
             for value, f in _real_pairs(exact(problem.plant.A) + B * W):
                 if stays * value**2 >= 1:
-                    yield ((value**2 - 1) * len(nodes) * _square(M * f) / _square(W * f)).sqrt()
+                    seen = sum((arb(float(problem.weights[j])) ** 2 for j in nodes), arb(0)) * _square(M * f)
+                    yield ((value**2 - 1) * seen / _square(W * f)).sqrt()
 
 
 def _closed(problem: Problem, s: int, i: int) -> frozenset[int]:

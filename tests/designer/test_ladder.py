@@ -51,7 +51,7 @@ def test_the_distances() -> None:
     assert ladder.lines() == [
         "2.000000  floor",
         "2.200000  exact gain of these gains",
-        "2.200000  gamma, certified: -45.0 % against all that Theorem 2 can give, 10.0 % above the floor",
+        "2.200000  gamma, certified: 45.0 % below all that Theorem 2 can give, 10.0 % above the floor",
         "3.100000  exact gain of Theorem 2's gains",
         "4.000000  proved: no gains have less by Theorem 2",
         "4.100000  Theorem 2's bound, as a solver gave it",
@@ -100,7 +100,7 @@ def test_numbers_of_different_length_stand_in_one_column() -> None:
 
 def test_bounds_from_below_are_rounded_down() -> None:
     lines = Ladder(1.0000019, None, 2.0, None, None, theorem2_least=1.2345678).lines()
-    assert (lines[0], lines[2]) == ("1.000001  floor", "1.234567  proved: no gains have less by Theorem 2")
+    assert (lines[0], lines[1]) == ("1.000001  floor", "1.234567  proved: no gains have less by Theorem 2")
 
 
 def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
@@ -108,7 +108,7 @@ def test_an_lmi_beyond_the_paper_is_not_theorem_2() -> None:
     lines = Ladder(0.0, (1.0, 1.0), 1.0, (2.0, 2.0), 4.0, "the LMI", theorem2_least=4.0).lines()
     assert lines[1:] == [
         "1.000000  exact gain of these gains",
-        "1.000000  gamma, certified: -75.0 % against all that the LMI can give",
+        "1.000000  gamma, certified: 75.0 % below all that the LMI can give",
         "2.000000  exact gain of the LMI's gains",
         "4.000000  proved: no gains have less by the LMI",
         "4.000000  the LMI's bound, as a solver gave it",

@@ -50,7 +50,7 @@ def test_design_verify_show(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert run("design", "two-nodes", "-o", "gains.json", "--force", "--method", "decomposed") == 0
     printed = capsys.readouterr().out
     assert printed.startswith("two-nodes by decomposed: gamma = 1.41421")
-    assert "ladder     1.414214  floor\n" in printed
+    assert "ladder     1.414213  floor\n" in printed
 
 
 def test_verify_says_of_which_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -382,7 +382,7 @@ def test_a_solver_that_stalls_is_tried_again_in_other_units(monkeypatch: pytest.
     def clarabel(cones: Any, q: Array) -> conic.Answer:
         nonlocal calls
         calls += 1
-        u, record = solver(cones, q)
+        u, record, _ = solver(cones, q)
         status = "optimal" if calls == 2 else "optimal_inaccurate"
         return conic.Answer(u, record.model_copy(update={"status": status}))
 
