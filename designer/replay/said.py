@@ -67,13 +67,22 @@ class Said:
                 self.unheard |= {(step, i) for step in event.steps if event.kind != LATE}
 
 
-def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external: tuple[bool, ...], steps: int) -> Flags:
+def excused(
+    topics: Mapping[str, Topic],
+    columns: Columns,
+    said: Said,
+    external: tuple[bool, ...],
+    steps: int,
+    *,
+    plant_is_whole: bool,
+) -> Flags:
     """(steps, topics): which messages are not there because nobody was there to send them.
 
     A node that begins again says so; for the plant, and for a node that never came back, the coordinator has said
     that it was gone, or, where it was gone itself, the nodes that they heard nothing of it. A node to which the last
-    modes did not come has not given its last account. A sensor's measurement may be missing wherever its node says that
-    it had none.
+    modes did not come has not given its last account. The plant that was asked to go, or stood still as the run ended,
+    has not come to the last steps where all that it is known to have sent is there, `plant_is_whole`. A sensor's
+    measurement may be missing wherever its node says that it had none.
     """
     has = columns["has"][:steps]
     found = np.zeros_like(has)
@@ -89,23 +98,26 @@ def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external:
     for topic in simulated:
         for first, end in _gaps(has[:, topic.place]):
             found[first:end, topic.place] = _went(said.gone.get(PLANT, []), first, end)
-            found[_broken_off(has, said), topic.place] = True
+            found[first:end, topic.place] |= plant_is_whole and end == len(has)
+            found[_broken_off(columns, said, steps), topic.place] = True
     return found
 
 
-def _broken_off(has: Flags, said: Said) -> Flags:
+def _broken_off(columns: Columns, said: Said, steps: int) -> Flags:
     """(steps,): at which the plant's state is not there, nor some measurements, and their nodes say they never came.
 
-    A node that is not there in such a step either says nothing.
+    A node that is not there in such a step either, or begins again in it, says nothing.
     """
+    has, origin = columns["has"][:steps], columns["origin"][:steps]
     unheard = np.zeros((len(has), len(said._nodes)), dtype=bool)
     for step, i in said.unheard:
         if step < len(has):
             unheard[step, i] = True
     estimates = 2 + 2 * np.arange(len(said._nodes))
     unheard &= ~has[:, estimates + 1]
-    missed = ~has[:, estimates + 1] & ~has[:, estimates]
-    explained = unheard | has[:, estimates + 1] | ~has[:, estimates]
+    says_nothing = ~has[:, estimates] | (origin[: len(has)] != -1)
+    missed = ~has[:, estimates + 1] & says_nothing
+    explained = unheard | has[:, estimates + 1] | says_nothing
     return np.asarray((unheard | missed).any(axis=1) & explained.all(axis=1) & ~has[:, 1])
 
 
