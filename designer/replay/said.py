@@ -99,25 +99,23 @@ def excused(
         for first, end in _gaps(has[:, topic.place]):
             found[first:end, topic.place] = _went(said.gone.get(PLANT, []), first, end)
             found[first:end, topic.place] |= plant_is_whole and end == len(has)
-            found[_broken_off(columns, said, steps), topic.place] = True
+            found[_broken_off(has, said), topic.place] = True
     return found
 
 
-def _broken_off(columns: Columns, said: Said, steps: int) -> Flags:
+def _broken_off(has: Flags, said: Said) -> Flags:
     """(steps,): at which the plant's state is not there, nor some measurements, and their nodes say they never came.
 
-    A node that is not there in such a step either, or begins again in it, says nothing.
+    A node that is not there in such a step either says nothing.
     """
-    has, origin = columns["has"][:steps], columns["origin"][:steps]
     unheard = np.zeros((len(has), len(said._nodes)), dtype=bool)
     for step, i in said.unheard:
         if step < len(has):
             unheard[step, i] = True
     estimates = 2 + 2 * np.arange(len(said._nodes))
     unheard &= ~has[:, estimates + 1]
-    says_nothing = ~has[:, estimates] | (origin[: len(has)] != -1)
-    missed = ~has[:, estimates + 1] & says_nothing
-    explained = unheard | has[:, estimates + 1] | says_nothing
+    missed = ~has[:, estimates + 1] & ~has[:, estimates]
+    explained = unheard | has[:, estimates + 1] | ~has[:, estimates]
     return np.asarray((unheard | missed).any(axis=1) & explained.all(axis=1) & ~has[:, 1])
 
 
