@@ -120,6 +120,7 @@ DOORS = {
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/", "designer/library/peakmesh/answers.py"],  # there for the type checker
     "setproctitle": ["agent/nursery.py"],
+    "shtab": ["designer/commands/program.py"],
     "rich": ["agent/commands/words.py", "designer/commands/", "designer/watch/table.py"],
     "distributed": ["designer/workers.py"],
 }
