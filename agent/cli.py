@@ -11,7 +11,7 @@ from contextlib import redirect_stderr
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
 
-from agent.commands import keys, roles, run
+from agent.commands import doctor, keys, roles, run
 from agent.commands.quiet import Quiet
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_INPUT, EXIT_INTERRUPTED, PeakmeshError
 from agent.contract.extras import needing
@@ -26,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_run(commands)
     roles.add_roles(commands, {} if "--child" in words else os.environ)  # a launcher says all to its children
     keys.add_keys(commands)
+    doctor.add_doctor(commands)
     return perform(parser.parse_args(words))
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 import agent.cli
+from agent.commands.doctor import add_doctor
 from agent.commands.roles import add_roles
 from agent.contract.errors import EXIT_INPUT
 from designer.commands import (
@@ -65,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_roles(commands)
     watch.add_watch(commands)
     keys.add_keys(commands)
+    add_doctor(commands)
     program.add_completion(commands, parser)
     program.add_help(commands, parser)
     options = parser.parse_args(arguments)

@@ -147,7 +147,9 @@ def _export_table(options: argparse.Namespace) -> int:
     if facts["damage"]:
         print(f"warning: {log.label}: {facts['damage']}", file=sys.stderr)
     if facts["absent"]:
-        print(f"warning: {counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr)
+        print(
+            f"warning: {counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr
+        )
     print(json.dumps(facts) if options.json else _text(facts))
     return EXIT_GOOD
 
