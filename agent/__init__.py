@@ -9,5 +9,5 @@ a whole run     plan: what the coordinator decides; receipts: what the recorder 
                 nursery: the process that they are forked from; children: how it is spoken to
                 guests: programs of the user's in place of roles
                 authority: everybody's certificates; guard: what may come in; refusals: what is told of the rest
-the machine     cli: the program; signals: what asks it to end
+the machine     cli: the program; signals: what asks it to end; doctor: whether a run would go well
 """

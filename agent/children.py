@@ -52,13 +52,17 @@ class Child:
                 stream.close()
 
 
+def folder_of_sockets() -> str:
+    """Where temporary files go, if the addresses of sockets there are not too long."""
+    temporary = tempfile.gettempdir()
+    return temporary if len(os.fsencode(temporary)) <= LONGEST_FOLDER else "/tmp"
+
+
 class Nursery:
     """Starts children, and tells when they end. `folder` is theirs for sockets, for as long as one of them is there."""
 
     def __init__(self) -> None:
-        temporary = tempfile.gettempdir()
-        is_short = len(os.fsencode(temporary)) <= LONGEST_FOLDER
-        self.folder = Path(tempfile.mkdtemp(prefix="peakmesh-", dir=temporary if is_short else "/tmp"))
+        self.folder = Path(tempfile.mkdtemp(prefix="peakmesh-", dir=folder_of_sockets()))
         self._children: dict[int, Child] = {}  # those that have not ended
         self._programs = set[int]()  # children that are not ours
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the nursery

@@ -7,10 +7,12 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads only cost memory and time
 
-from agent.commands import keys, roles, run
+from agent.commands import doctor, keys, roles, run
+from agent.commands.quiet import Quiet
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_INPUT, EXIT_INTERRUPTED, PeakmeshError
 from agent.contract.extras import needing
 
@@ -24,6 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_run(commands)
     roles.add_roles(commands, {} if "--child" in words else os.environ)  # a launcher says all to its children
     keys.add_keys(commands)
+    doctor.add_doctor(commands)
     return perform(parser.parse_args(words))
 
 
@@ -40,7 +43,7 @@ def open_streams() -> None:
 def perform(options: argparse.Namespace) -> int:
     """Call the chosen command; an error becomes one sentence on stderr and an exit code."""
     try:
-        with needing(options.command):
+        with needing(options.command), redirect_stderr(Quiet(sys.stderr) if options.quiet else sys.stderr):
             code = options.call(options)
         sys.stdout.flush()
         return int(code)

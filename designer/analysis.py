@@ -32,7 +32,6 @@ from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
 from designer.ladder import Ladder, interval
 from designer.lmi import beyond_paper
-from designer.lmi.multipliers import least_of_lmi
 from designer.model.error_model import error_model, stacked_links
 from designer.proof.prover import Prover
 from designer.search.exact_design import certify, confirmed, lower_end
@@ -218,6 +217,8 @@ def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radi
 
     `radius`: how large boxes may be for a gamma that is a little larger.
     """
+    from designer.lmi.multipliers import least_of_lmi  # loads a solver, which reading gains does not take
+
     refuse_nothing_to_estimate(problem)
     model = error_model(problem, *stacked_links(problem, given.K, given.H))
     gain = exact_gain(model)

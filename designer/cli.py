@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 import agent.cli
+from agent.commands.doctor import add_doctor
 from agent.commands.roles import add_roles
 from agent.contract.errors import EXIT_INPUT
 from designer.commands import (
@@ -21,6 +22,7 @@ from designer.commands import (
     identify,
     keys,
     new,
+    program,
     recordings,
     recover,
     report,
@@ -43,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Design, run and audit distributed peak-error filters.",
         epilog="Exit codes: 0 good; 1 the answer is no; 2 bad input; 3 the run broke; 129, 130 or 143 by a signal.",
     )
-    parser.add_argument("--version", action="version", version=f"peakmesh {version('peakmesh')}")
+    parser.add_argument("-V", "--version", action="version", version=f"peakmesh {version('peakmesh')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     runs.add_demo(commands)
     new.add_new(commands)
@@ -64,6 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_roles(commands)
     watch.add_watch(commands)
     keys.add_keys(commands)
+    add_doctor(commands)
+    program.add_completion(commands, parser)
+    program.add_help(commands, parser)
     options = parser.parse_args(arguments)
     if options.command is None:
         parser.print_help(sys.stderr)

@@ -39,8 +39,9 @@ ROOMS = {
     "agent.children": "",
     "agent.guests": "",
     "agent.launch": "agent.children agent.contract.recording agent.guests agent.plan agent.signals",
-    "agent.commands": "agent.authority agent.contract.recording agent.faults agent.guard agent.guests agent.launch "
-    "agent.network agent.plan agent.roles",
+    "agent.doctor": "agent.children agent.network agent.roles",
+    "agent.commands": "agent.authority agent.contract.recording agent.doctor agent.faults agent.guard agent.guests "
+    "agent.launch agent.network agent.plan agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",
@@ -120,6 +121,7 @@ DOORS = {
     "flint": ["designer/proof/"],
     "matplotlib": ["designer/report/", "designer/library/peakmesh/answers.py"],  # there for the type checker
     "setproctitle": ["agent/nursery.py"],
+    "shtab": ["designer/commands/program.py"],
     "rich": ["agent/commands/words.py", "designer/commands/", "designer/watch/table.py"],
     "distributed": ["designer/workers.py"],
 }

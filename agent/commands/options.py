@@ -27,6 +27,7 @@ def add_command(
     parser = commands.add_parser(name, help=about, description=f"{about[:1].upper()}{about[1:]}.", allow_abbrev=False)
     parser.set_defaults(call=call)
     parser.add_argument("-v", "--verbose", action="store_true", help="show where an error came from")
+    parser.add_argument("-q", "--quiet", action="store_true", help="on stderr nothing but errors and warnings")
     return parser
 
 

@@ -166,7 +166,8 @@ def design_and_save(
         )
     if gains.solver.status.startswith("out of time"):
         print(
-            f"the search was out of time after {gains.solver.iterations} steps; --budget gives it more", file=sys.stderr
+            f"warning: the search was out of time after {gains.solver.iterations} steps; --budget gives it more",
+            file=sys.stderr,
         )
     gains.save(path, force=force)
     proved = gains.certificate

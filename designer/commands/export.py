@@ -145,9 +145,11 @@ def _export_table(options: argparse.Namespace) -> int:
     )
     facts = export(log, output, to=options.to, wide=options.wide, force=options.force)
     if facts["damage"]:
-        print(f"{log.label}: {facts['damage']}", file=sys.stderr)
+        print(f"warning: {log.label}: {facts['damage']}", file=sys.stderr)
     if facts["absent"]:
-        print(f"{counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr)
+        print(
+            f"warning: {counted(facts['absent'], 'message')} of the run not in it: NaN in their place", file=sys.stderr
+        )
     print(json.dumps(facts) if options.json else _text(facts))
     return EXIT_GOOD
 

@@ -117,7 +117,7 @@ def test_the_default_of_a_large_problem(
 def test_what_there_is_when_time_is_over_is_certified(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A budget too short for one step leaves the gains that the search would have started from, and says so."""
     assert run("design", "two-nodes", "-o", "gains.json", "--budget", "0.000001s") == 0
-    assert capsys.readouterr().err == "the search was out of time after 0 steps; --budget gives it more\n"
+    assert capsys.readouterr().err == "warning: the search was out of time after 0 steps; --budget gives it more\n"
     assert Gains.load(Path("gains.json")).solver.status.startswith("out of time; from ")
     assert run("verify", "gains.json") == 0
 
