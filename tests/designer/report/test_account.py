@@ -14,8 +14,8 @@ from agent.contract import schedule
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from designer.problems import find
-from designer.proof.certificate import prover_of
-from designer.report.account import Account, Chance, over_nodes, single_run_gamma
+from designer.proof.certificate import prover_of, single_run
+from designer.report.account import Account, Chance, over_nodes
 from designer.synthesis import design
 
 GOLDEN_RUN = GOLDEN / "zhu2020-lossy.mcap"
@@ -117,8 +117,9 @@ def exact() -> Gains:
 
 def test_of_an_exact_certificate_it_is_the_least_gamma_that_its_matrix_proves(exact: Gains) -> None:
     """It is not below the exact gain, which says nothing of single runs; of a thousandth less (18) is not proved."""
-    gamma, prover = single_run_gamma(exact), prover_of(exact)
-    assert gamma is not None
+    known, prover = single_run(exact), prover_of(exact)
+    assert known is not None
+    gamma, _ = known
     assert exact.certificate.exact is not None
     assert gamma >= exact.certificate.exact[0]
     assert prover.theorem1(gamma).holds
@@ -131,5 +132,5 @@ def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: 
     P = prover_of(exact).P
     assert P is not None
     turned = exact.certificate.model_copy(update={"form": "full", "P": {"linked": -P[0]}})
-    assert single_run_gamma(exact.model_copy(update={"certificate": turned})) is None
+    assert single_run(exact.model_copy(update={"certificate": turned})) is None
     assert account_of(tmp_path).chance is None
