@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from pydantic import ValidationError
@@ -149,19 +149,44 @@ class Guard:
             self._trust(who)
         return is_first
 
-    def went(self, who: str, session: str) -> bool:
-        """Its token is gone, though what it has sent before still counts; whether nobody of the name is there now."""
+    def went(self, who: str, session: str) -> bool | None:
+        """Its token is gone, though what it has sent before still counts; whether nobody of the name is there now.
+
+        None where it did not count.
+        """
         with self._lock:
             there = self._sessions[who]
-            was_there = bool(there)
+            counted = there[:1] == [session]
             if session in there:
                 there.remove(session)
             self._trust(who)
-            return was_there and not there
+            return not there if counted else None
+
+    def prefer(self, cast: Mapping[str, str]) -> None:
+        """Of several of one name that are there, the coordinator has begun with the session in `cast`."""
+        with self._lock:
+            for who, session in cast.items():
+                there = self._sessions.get(who, [])
+                if session in there:
+                    there.sort(key=lambda other: other != session)
+                    self._trust(who)
 
     def trusts(self, who: str, session: str) -> bool:
         """Whether what comes from this session is from `who`."""
         return session in self._trusted.get(who, ())
+
+    def is_first(self, who: str, session: str) -> bool:
+        """Whether, of the sessions of `who` that are there, this one counts; what others had sent has come by then."""
+        return self._sessions.get(who, [])[:1] == [session]
+
+    def cast(self, whos: Iterable[str]) -> dict[str, str]:
+        """The sessions that count of those who are there, by name."""
+        with self._lock:
+            return {who: self._sessions[who][0] for who in whos if self._sessions.get(who)}
+
+    def is_there(self, who: str, session: str) -> bool:
+        """Whether a session of that name is there, be it believed or not."""
+        return session in self._sessions.get(who, ())
 
     def are_several(self, who: str) -> bool:
         """Whether two of one name are there."""

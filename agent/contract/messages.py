@@ -213,6 +213,8 @@ class Control(Word):
     A paced run has a `period` in seconds, 0 in lock-step. From a step's mode on a node waits for its measurement for
     `measure_by` and for its neighbours' pairs for `hear_by` of a period. `faults` are what it is to survive. Who joins
     while it goes on is told to "start" too: `step` is the next one.
+
+    `cast` names the sessions of those who are to start, at the beginning everybody's: nobody else of their names does.
     """
 
     order: Literal["start", "close", "stop", "tell"]
@@ -229,6 +231,7 @@ class Control(Word):
     identity: str = ""  # of this run alone, though others have its name
     faults: list[str] = Field(default=[])
     version: str = ""  # of the coordinator
+    cast: dict[str, str] = Field(default={})
 
 
 class Facts(Frozen):

@@ -7,7 +7,7 @@ from agent.contract.problem import Problem
 
 WORDS = 2**16  # bytes: an event about 1024 steps, with a long sentence, has 58 000
 NUMBER = 25  # bytes: -2.2250738585072014e-308, and a comma
-COUNTED = 2 * 24  # bytes: what the recorder says of each sender, beside its name: the last number and the last step
+EACH = 64  # bytes said of each participant, beside its name: its session, or the last number and the last step
 
 
 def largest(problem: Problem) -> int:
@@ -15,5 +15,5 @@ def largest(problem: Problem) -> int:
     most = max(len(node.C) for node in problem.nodes)  # numbers in a measurement
     numbers = problem.nx + problem.nz + max(problem.nw, most) + problem.n
     everybody = [*participants(problem), *map(sensor_who, problem.node_names)]
-    names = sum(3 * len(who) + COUNTED for who in everybody) + sum(len(topic) + 3 for topic in data_topics(problem))
+    names = sum(3 * len(who) + EACH for who in everybody) + sum(len(topic) + 3 for topic in data_topics(problem))
     return WORDS + NUMBER * numbers + names

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from typing import TypeVar
 
 from agent.contract.errors import InputError, RunBroken
-from agent.contract.keys import CONTROL, COORDINATOR, in_words, joining
+from agent.contract.keys import CONTROL, COORDINATOR, RECORDER, in_words, joining
 from agent.contract.messages import Control, Joining, Leaving, Ready, Word
 from agent.network.acquaintance import Acquaintance, stray_sensor
 from agent.network.addresses import machine
@@ -49,6 +49,7 @@ class Barrier:
         self._absent: set[str] = set()  # whom we have still to meet
         self._deadline = math.inf
         self._left = ""  # who went away
+        self._over: Control | None = None  # the run is, for the others
         self._fault: InputError | None = None  # why the run cannot be
         self._acquaintance = Acquaintance(self._joining())  # the coordinator's
         self.warn: Callable[[str], None] = lambda sentence: None  # the coordinator's, of those who join
@@ -102,6 +103,8 @@ class Barrier:
             word = self._words.take(deadline)
             if word is None:
                 if time.monotonic() >= deadline:
+                    if self._over is not None:
+                        raise RunClosed(self._over)
                     raise self._fault or RunBroken(self._why_not(missing, kind))
             elif not self._heed(word, kind):
                 if isinstance(word, kind):
@@ -111,10 +114,13 @@ class Barrier:
     def _heed(self, word: Incoming, kind: type[object]) -> bool:
         """Deal with what is of the barrier; whether that was all. Raises where no start is to be waited for."""
         match word:
+            case Control(order="close" | "stop", step=step) if step and self._who == RECORDER:
+                self._over = word  # but the others still keep what was not recorded: it may yet be asked to join
             case Control(order="close" | "stop"):
                 raise RunClosed(word)
-            case Control(step=step) if kind is not Control and step:
-                raise UnderWay(word)
+            case Control(order="start", step=step, cast=cast) if step:
+                if cast.get(self._who) == self._identity:  # told to us, and to no namesake
+                    raise UnderWay(word)
             case Ready(underway=True) if self._who == COORDINATOR:  # the recorder hears it, too
                 raise Orphaned(word)
             case Namesake(identity=identity):

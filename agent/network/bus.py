@@ -68,6 +68,7 @@ from agent.network.outbox import Outbox
 from agent.network.session import CAPACITY, Session
 from agent.network.words import (
     ChannelClosed,
+    Duty,
     Ignored,
     Incoming,
     Namesake,
@@ -93,6 +94,7 @@ HOUSE_SECONDS = 0.5  # between two looks after the queues
 BUSY_SECONDS = 0.01  # where one of them was filling
 TELL_SECONDS = 1.0  # between two words on what was refused
 LONGEST_WORD = 1 << 20  # bytes
+MOST_POSTPONED = 64  # requests for replay
 
 T = TypeVar("T")
 Said = TypeVar("Said", Control, Acknowledged, Joining, Leaving, Ready, Refusals)
@@ -121,6 +123,7 @@ class Bus:
         self._house_due = self._told = 0.0  # when to look after the house; when we last told what was refused
         self._reported = 0  # messages that we have told of
         self._word = 0  # number of our next word
+        self._postponed: list[Duty] = []  # requests for replay that cannot be answered yet
         self._unanswered: Counter[str] = Counter()  # requests for replay, by whom they were made to
         self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
         self._last_word: Acknowledged | None = None  # that the recording is closed
@@ -200,10 +203,26 @@ class Bus:
 
     def advertise(self, topics: Iterable[str]) -> None:
         """Announce that these topics will be published, and offer replays of them."""
-        self._session.offer_replay(self.who, self._outbox.since, is_for=lambda by: self.guard.trusts(RECORDER, by))
+        self._session.offer_replay(self.who, self._outbox.since, is_for=self._may_ask)
         for topic in topics:
             express = model_of(topic) is Estimate  # the only message that somebody waits for right now
             self._session.advertise(topic, express=express)
+
+    def _may_ask(self, by: str, question: Duty) -> bool | None:
+        """Whether a session is the recorder's; None where it will be when the one before it is known to have gone."""
+        if self.guard.trusts(RECORDER, by) or not self.guard.is_there(RECORDER, by):
+            return self.guard.trusts(RECORDER, by)
+        if len(self._postponed) == MOST_POSTPONED:
+            return False
+        self._postponed.append(question)
+        return None
+
+    def _ask_again(self) -> Ignored:
+        """Somebody else is the recorder now: what was postponed is asked once more."""
+        postponed, self._postponed = self._postponed, []
+        for question in postponed:
+            self._words.put(question)
+        return Ignored()
 
     def enter(self) -> None:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
@@ -215,7 +234,7 @@ class Bus:
             self._listen(leaving("*"), Leaving)
             self._listen(refusals("*"), Refusals)
         else:
-            self._listen(CONTROL, Control)
+            self._listen(CONTROL, Control, heed=self._heed_cast)
         if self.who != RECORDER:
             self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
         self._session.listen(refused(self.who, self._session.identity), self._refuse, overflow=lambda: None)
@@ -225,10 +244,15 @@ class Bus:
         """Somebody has come or gone; called on zenoh's threads."""
         if not self.guard.takes_part(who):
             return
-        if self.guard.came(who, session) if present else self.guard.went(who, session):
-            self._words.put(lambda: Peer(who, present))
-        if who == self.who and present:
-            self._words.put(lambda: Namesake(session))
+        if present:
+            if self.guard.came(who, session):
+                self._words.put(lambda: Peer(who, True))
+            if who == self.who:
+                self._words.put(lambda: Namesake(session))
+        elif (is_alone := self.guard.went(who, session)) is not None:
+            self._words.put(lambda: Peer(who, not is_alone, succeeds=not is_alone))
+            if who == RECORDER:
+                self._words.put(self._ask_again)
 
     def _refuse(self, sentence: bytes) -> Ignored:
         """Our place is taken, says a namesake; nobody can say so who is not there.
@@ -237,16 +261,25 @@ class Bus:
         """
         if (self.has_begun and not self.is_late) or not self.guard.are_several(self.who):
             return Ignored()
-        raise Refused(f'{in_words(self.who)} takes part in run "{self.run}" already; start it once')
+        raise self._place_is_taken()
 
     def _heed_namesake(self, identity: str) -> None:
         """Of two processes with one name the one stays that has begun, else the earlier one. Raises Refused."""
         own = self._session.identity
-        sentence = f'{in_words(self.who)} takes part in run "{self.run}" already; start it once'
         if identity != own and self.has_begun:
-            self._session.say(refused(self.who, identity), sentence.encode())
+            self._session.say(refused(self.who, identity), str(self._place_is_taken()).encode())
         elif identity < own:
-            raise Refused(sentence)
+            raise self._place_is_taken()
+
+    def _heed_cast(self, control: Control) -> None:
+        """Of two processes with one name the one begins that the coordinator names. Raises Refused."""
+        if not self.has_begun:
+            if control.cast.get(self.who, self._session.identity) != self._session.identity:
+                raise self._place_is_taken()
+            self.guard.prefer(control.cast)
+
+    def _place_is_taken(self) -> Refused:
+        return Refused(f'{in_words(self.who)} takes part in run "{self.run}" already; start it once')
 
     def _listen(self, topic: str, model: type[Said], *, heed: Callable[[Said], None] = lambda word: None) -> None:
         name = topic.partition("/")[0]
@@ -371,7 +404,7 @@ class Bus:
                     self._given_up = math.inf if present else time.monotonic() + self.network.wait
                     if present:
                         self._say(ready(self.who), self._ready.model_copy(update=self._underway()))
-                case Peer(who="coordinator", present=False):
+                case Peer(who="coordinator", present=False) | Peer(who="coordinator", succeeds=True):
                     raise RunBroken("the coordinator was lost: its process ended, or the network to it failed")
             if word is not None or time.monotonic() >= deadline:
                 return word

@@ -127,16 +127,24 @@ class Session:
         if self._watched[sent.topic]:
             self._shown[sent.topic].put(sent.payload)
 
-    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str], bool]) -> None:
-        """Answer requests for the messages of `who` from a number on, of a session that they are for."""
+    def offer_replay(
+        self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str, Duty], bool | None]
+    ) -> None:
+        """Answer requests for the messages of `who` from a number on, of a session that they are for.
+
+        `is_for` is given the request, too: where it says None, it will hand that over once more.
+        """
         quota = Quota(CAPACITY)
 
         def answer(query: zenoh.Query) -> Ignored | None:
-            quota.leave()
             first, by = (query.parameters.get(name) or "" for name in ("from", "by"))
+            is_number = first.isdecimal() and first.isascii() and len(first) < 20
+            may_ask = is_number and "_anyke" in query.parameters and is_for(by, lambda: answer(query))
+            if may_ask is None:
+                return Ignored()
+            quota.leave()
             with query:
-                is_number = first.isdecimal() and first.isascii() and len(first) < 20
-                if not (is_number and "_anyke" in query.parameters and is_for(by)):
+                if not may_ask:
                     return Ignored()  # not the recorder's question
                 for sent in since(int(first)):
                     query.reply(key(self._run, sent.topic, who=who), sent.payload, attachment=sent.stamp.encode())

@@ -30,10 +30,11 @@ class Sample(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """Somebody who has come or gone."""
+    """Somebody who has come or gone. `succeeds`: another process of that name was there, and is gone."""
 
     who: str
     present: bool
+    succeeds: bool = False
 
 
 class Namesake(NamedTuple):

@@ -151,11 +151,11 @@ class Conductor:
         self._bus.enter()
         self._bus.guard.begin(steps=self._plan.steps, external=self._plan.external, paced=self._plan.pace is not None)
         try:
-            self._gather()
+            cast = self._gather()
         except Orphaned as run:
             self._take_up(run.ready)
             return
-        self._order("start")
+        self._order("start", cast=cast)
         self._started = True
         self._announce("start", f"{self._plan.steps} steps, seed {self._plan.seed}")
         for fault in self._plan.faults:
@@ -165,10 +165,11 @@ class Conductor:
         """Go on with the chain at the step after the last mode that anybody has had."""
         answers = self._bus.gather_underway(first, seconds=TAKE_UP_SECONDS)
         self._refuse_other_gains(answers)
+        self._bus.guard.prefer({who: answer.session for who, answer in answers.items()})
         self._identity = first.identity
         self.complete = max(answer.step for answer in answers.values())
         self._again = True
-        self._order("start")
+        self._order("start", cast=self._bus.guard.cast(self._everybody))
         greeting = self._bus.greeted(seconds=self._bus.network.wait, heed=self._welcome)
         self._recorded = min(self.complete, greeting.steps)
         self._started = True
@@ -178,13 +179,16 @@ class Conductor:
         """Whoever has come is told that the run is under way."""
         match word:
             case Peer(who=who, present=True) if self._takes_part(who):
-                self._order("start")
+                self._order("start", cast=self._bus.guard.cast([who]))
 
-    def _gather(self) -> None:
+    def _gather(self) -> dict[str, str]:
+        """Wait for everybody; the session of each."""
         everybody = [*self._everybody, *map(sensor_who, self._plan.external)]
         for who in self._bus.meet(everybody, warn=lambda sentence: self._report({"warning": sentence})):
             self._report({"joined": who})
-        self._refuse_other_gains(self._bus.gather(self._everybody))
+        answers = self._bus.gather(self._everybody)
+        self._refuse_other_gains(answers)
+        return {who: ready.session for who, ready in answers.items()}
 
     def _refuse_other_gains(self, answers: Mapping[str, Ready]) -> None:
         own = self._gains.digest()
@@ -224,7 +228,9 @@ class Conductor:
                 self._heed(acknowledged.broken_off)
             case Refusals():
                 self._note(word)
-            case Peer(who=who, present=present) if self._takes_part(who):
+            case Peer(who=who, present=present, succeeds=succeeds) if self._takes_part(who):
+                if succeeds:
+                    self._announce(GONE, in_words(who), about=who)
                 self._announce("back" if present else GONE, in_words(who), about=who)
                 self._welcome(word)
             case Peer(who=who, present=True):
@@ -250,8 +256,7 @@ class Conductor:
         self._report({"ending": ""})
         self._tell_refused(hurry=True)
         self._announce("end", "all steps are done")
-        self._order("close")
-        last_word = self._bus.wait_for_close(self._note)
+        last_word = self._end("close")
         if last_word is None:
             raise RunBroken("all steps are done, but the recorder did not close the recording")
         return last_word
@@ -274,13 +279,27 @@ class Conductor:
         if self._started:
             self._tell_refused(hurry=True)
             self._announce("stop", reason)
-        self._order("stop", reason)
         if self._started:
-            return self._bus.wait_for_close(self._note)
+            return self._end("stop", reason)
+        self._order("stop", reason)
         self._bus.wait_until_gone(self._everybody, greet=lambda: self._order("stop", reason))
         return None
 
-    def _order(self, order: Literal["start", "close", "stop"], reason: str = "") -> None:
+    def _end(self, order: Literal["close", "stop"], reason: str = "") -> Acknowledged | None:
+        """Order the end; the recorder's last word."""
+        self._order(order, reason)
+
+        def heed(word: Incoming | None) -> None:
+            self._note(word)
+            if word == Peer(RECORDER, True, succeeds=True):  # the others still keep what the one before has not got
+                self._welcome(word)
+                self._order(order, reason)
+
+        return self._bus.wait_for_close(heed)
+
+    def _order(
+        self, order: Literal["start", "close", "stop"], reason: str = "", *, cast: Mapping[str, str] | None = None
+    ) -> None:
         plan = self._plan
         self._bus.order(
             Control(
@@ -294,6 +313,7 @@ class Conductor:
                 gains=self._gains.digest(),
                 identity=self._identity,
                 faults=list(plan.faults),
+                cast=dict(cast or {}),
                 **({} if plan.pace is None else plan.pace._asdict()),
             )
         )
@@ -322,7 +342,7 @@ class Conductor:
                     self._bus.guard.refuse(ACKNOWLEDGED, UNTIMELY)
                 case Refusals() as refusals:
                     self._note(refusals)
-                case Peer(who=who, present=False) if self._takes_part(who):
+                case Peer(who=who, present=False) | Peer(who=who, succeeds=True) if self._takes_part(who):
                     raise Lost(who, self._bus.reason_of(who))
                 case Peer(who=who, present=True) if not self._takes_part(who):
                     self._doubt(who)

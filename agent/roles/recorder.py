@@ -112,7 +112,6 @@ class Recorder:
         self._goes_on, self._report = goes_on, report
         self._publishers = sorted({sender_of(topic) for topic in channels})
         self._quantum = max(1, window // 4)  # steps between acknowledgements
-        self._sessions: dict[str, str] = {}  # of those who are there: a namesake shall not go on with their numbers
         self._acknowledged = 0
         self._quiet_since = time.monotonic()
         self.broken_off: BrokenOff | None = None
@@ -129,12 +128,10 @@ class Recorder:
             match word:
                 case Sample():  # a replay that we asked for
                     self._take_replayed(word)
-                case Ready(who=who, session=session, asks=asks) if who in self._publishers:
-                    if self._sessions.setdefault(who, session) == session and asks:
+                case Ready(who=who, session=session, asks=True) if who in self._publishers:
+                    if self._bus.guard.is_first(who, session):
                         self._greet(who)
-                case Peer(who=who, present=False):
-                    self._sessions.pop(who, None)
-                case Peer(who=who) if self._is_late and who in self._publishers:
+                case Peer(who=who, present=True) if self._is_late and who in self._publishers:
                     self._ask(who)  # it was not there to be asked with everybody
             pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
@@ -201,8 +198,11 @@ class Recorder:
             self._acknowledge()
 
     def _greet(self, who: str) -> None:
-        """Tell somebody who has come back where their numbers go on; what a process before them kept is lost."""
-        self._take_waiting()
+        """Tell somebody who has come back where their numbers go on; what a process before them kept is lost.
+
+        That one is gone, and so all that it has sent is here.
+        """
+        self._take_waiting(most=2 * CAPACITY)
         self._record.flush()
         self._record.receipts.close_gap(who)
         self._acknowledge(greets=who)

@@ -359,7 +359,16 @@ class _Content:
                 if key.startswith("void.") and not self._kinds.isdisjoint({"resumed", GONE})
             },
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
-            excused=excused(self.topics, self.columns, self.said, self._external, steps) if self.is_paced else None,
+            excused=excused(
+                self.topics,
+                self.columns,
+                self.said,
+                self._external,
+                steps,
+                plant_is_whole=self.examiner.whole.get(PLANT) == recorded.get(PLANT, 0),
+            )
+            if self.is_paced
+            else None,
         )
 
 

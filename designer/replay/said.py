@@ -67,13 +67,22 @@ class Said:
                 self.unheard |= {(step, i) for step in event.steps if event.kind != LATE}
 
 
-def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external: tuple[bool, ...], steps: int) -> Flags:
+def excused(
+    topics: Mapping[str, Topic],
+    columns: Columns,
+    said: Said,
+    external: tuple[bool, ...],
+    steps: int,
+    *,
+    plant_is_whole: bool,
+) -> Flags:
     """(steps, topics): which messages are not there because nobody was there to send them.
 
     A node that begins again says so; for the plant, and for a node that never came back, the coordinator has said
     that it was gone, or, where it was gone itself, the nodes that they heard nothing of it. A node to which the last
-    modes did not come has not given its last account. A sensor's measurement may be missing wherever its node says that
-    it had none.
+    modes did not come has not given its last account. The plant that was asked to go, or stood still as the run ended,
+    has not come to the last steps where all that it is known to have sent is there, `plant_is_whole`. A sensor's
+    measurement may be missing wherever its node says that it had none.
     """
     has = columns["has"][:steps]
     found = np.zeros_like(has)
@@ -89,6 +98,7 @@ def excused(topics: Mapping[str, Topic], columns: Columns, said: Said, external:
     for topic in simulated:
         for first, end in _gaps(has[:, topic.place]):
             found[first:end, topic.place] = _went(said.gone.get(PLANT, []), first, end)
+            found[first:end, topic.place] |= plant_is_whole and end == len(has)
             found[_broken_off(has, said), topic.place] = True
     return found
 

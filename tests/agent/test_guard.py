@@ -274,12 +274,26 @@ def test_of_two_sessions_the_first_one_counts_as_long_as_it_is_there() -> None:
     made = guard()
     assert not made.came(PLANT, "stranger")
     assert (kind_of(made, sent("y", session="stranger")), kind_of(made, RIGHT["y"])) == (FORGED, "")
-    assert not made.went(PLANT, "stranger")  # and nobody thinks that the plant has gone
+    assert made.is_first(PLANT, f"session of {PLANT}")
+    assert made.is_there(PLANT, "stranger")
+    assert made.went(PLANT, "stranger") is None  # and nobody thinks that the plant has gone
     assert not made.came(PLANT, "stranger")
-    assert not made.went(PLANT, f"session of {PLANT}")
+    assert not made.is_first(PLANT, "stranger")
+    assert made.went(PLANT, f"session of {PLANT}") is False
+    assert made.is_first(PLANT, "stranger")
     assert kind_of(made, sent("y", session="stranger", number=11)) == ""
     assert made.went(PLANT, "stranger")
     assert made.came(PLANT, "a third")
+
+
+def test_whom_the_coordinator_has_begun_with_comes_first() -> None:
+    """And whoever is not there is not believed for that."""
+    made = guard()
+    made.came(PLANT, "second")
+    made.prefer({PLANT: "second", RECORDER: "a recorder that nobody has seen"})
+    assert made.cast([PLANT, RECORDER]) == {PLANT: "second"}
+    assert kind_of(made, sent("y", session="second")) == ""
+    assert kind_of(made, RIGHT["y"]) == ""  # what it sent before still counts
 
 
 STOP = Control(order="stop", steps=1, seed=0, window=1, external=[], reason="enough")

@@ -34,12 +34,14 @@ from agent.contract.messages import Acknowledged
 from agent.contract.recording.parts import files_of
 from agent.contract.recording.reader import RecordingReader
 from agent.filter import step
+from agent.guard import Guard
 from agent.network.bus import Bus
 from agent.network.words import Refused
 from agent.pacing import beat
 from agent.plan import Pace, Plan
 from agent.roles import coordinator, node, suffering, timekeeper
-from designer.replay import replay
+from designer.replay import log, replay
+from designer.replay.said import excused
 
 SEEDS, BLOCK = 200, 25
 GAINS = random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
@@ -120,6 +122,45 @@ def test_a_planted_bug_is_found(
     finding = first_found(range(1000))
     assert finding is not None
     record_property("found by seed", finding.seed)
+
+
+# what seeds have found: each was broken until what its mutant takes away was there
+def _plants_that_are_never_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log, "excused", lambda *args, plant_is_whole: excused(*args, plant_is_whole=False))
+
+
+def _a_start_for_everybody_who_hears_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Bus, "_heed_cast", lambda bus, control: None)
+
+
+def _greeted_though_the_one_before_may_still_be_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Guard, "is_first", lambda guard, who, session: True)
+
+
+def _succession_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    went = Guard.went
+    monkeypatch.setattr(Guard, "went", lambda guard, who, session: went(guard, who, session) or None)
+
+
+FOUND = {
+    749: _a_start_for_everybody_who_hears_it,
+    2697: _plants_that_are_never_whole,
+    3171: _a_start_for_everybody_who_hears_it,
+    3222: _greeted_though_the_one_before_may_still_be_heard,
+    4248: _plants_that_are_never_whole,
+    4749: _greeted_though_the_one_before_may_still_be_heard,
+    7704: _succession_unseen,
+    9833: _plants_that_are_never_whole,
+}
+
+
+@pytest.mark.parametrize(("seed", "mutant"), FOUND.items(), ids=map(str, FOUND))
+def test_what_a_seed_has_found_stays_mended(
+    monkeypatch: pytest.MonkeyPatch, seed: int, mutant: Callable[[pytest.MonkeyPatch], None]
+) -> None:
+    assert look_at(seed).broken == []
+    mutant(monkeypatch)
+    assert look_at(seed).broken != []
 
 
 # laws that could not be broken would hold nothing

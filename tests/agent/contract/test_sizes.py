@@ -65,6 +65,7 @@ def extremes(problem: Problem) -> list[bytes]:
             external=list(names),
             reason=SENTENCE,
             faults=["mute-link:node-100>node-101,steps=1000-2000"] * 500,
+            cast=dict.fromkeys(everybody, f"{LAST:020d}-{2**128 - 1:x}"),
         ),
     ]
     stamp = Stamp(LAST, LAST, who, bytes(DIGEST_SIZE)).encode()

@@ -106,6 +106,25 @@ def test_what_was_acknowledged_is_forgotten(coordinator: Bus, recorder: Bus) -> 
     assert steps_of(list(recorder.replayed([COORDINATOR]))) == list(range(1990, 2000))
 
 
+def test_the_next_recorder_is_answered_once_the_one_before_is_gone(coordinator: Bus) -> None:
+    """As long as that one is there nobody else is told anything; a question that comes early is not lost."""
+    network = Network(connect=(coordinator.locators()[0],), wait=PATIENCE)
+    publish(coordinator, range(3))
+    with Bus(network, run="test", who=RECORDER) as following:
+        with Bus(network, run="test", who=RECORDER) as before:
+            before.enter()
+            assert list(coordinator.meet([RECORDER])) == [RECORDER]
+            following.enter()
+            while following._words.take(time.monotonic() + PATIENCE) != Peer(COORDINATOR, True):
+                pass
+            following.request_replay(COORDINATOR, first=1)
+            while not coordinator._postponed:
+                coordinator._words.take(time.monotonic() + 0.01)
+        assert coordinator.receive(timeout=PATIENCE) == Peer(RECORDER, True, succeeds=True)
+        answer(coordinator)
+        assert steps_of(list(following.replayed([COORDINATOR]))) == [1, 2]
+
+
 def test_a_channel_holds_messages_in_order(coordinator: Bus) -> None:
     """Live messages wait in their channel until they are asked for, none is lost after the barrier."""
     with Bus(Network(connect=(coordinator.locators()[0],), wait=PATIENCE), run="test", who=PLANT) as plant:

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_recordings import Sent, observer_gains, random_gains, random_problem, real_problem, record, simulate
+from made_recordings import (
+    Sent,
+    observer_gains,
+    random_gains,
+    random_problem,
+    real_problem,
+    record,
+    simulate,
+    whole_run,
+)
 from paced_runs import PACE, SOON, PacedRun
 
 from agent.contract.gains import Gains
@@ -195,6 +204,27 @@ def test_nodes_may_say_alone_that_the_plant_was_gone(tmp_path: Path, there: int)
     gone = [m for m in sent if not (m.topic in lost and m.document["step"] == 20)]
     verdict = verdict_of(tmp_path, gone)
     assert verdict.exit_code == (0 if names else 1), verdict.text()
+
+
+@pytest.mark.parametrize("last", [1, 2, 7], ids=["state", "measurement too", "two steps"])
+def test_a_plant_need_not_have_come_to_the_end(tmp_path: Path, last: int) -> None:
+    """It stood still, or was asked to go, as the run ended: what it has sent, by its numbers and evidence, is there."""
+    everything = [m for m in TRUE if m.who == "plant"]
+    short = [m for m in TRUE if m not in everything[-last:]]
+    sent = {who: count - (last if who == "plant" else 0) for who, count in whole_run(HIDDEN.problem, STEPS).items()}
+    taken = everything[-last - 1]
+
+    def missing(sent_by: dict[str, int], messages: list[Sent] = short, **how: Any) -> int:
+        (tmp_path / "run.mcap").unlink(missing_ok=True)
+        path = record(tmp_path / "run.mcap", HIDDEN, messages, steps=STEPS, received=sent_by, period="0.1", **how)
+        verdict = replay(path)
+        assert (verdict.exit_code == 0) == (not verdict.missing.total), verdict.text()
+        return verdict.missing.total
+
+    assert missing(sent) == 0
+    assert missing(whole_run(HIDDEN.problem, STEPS)) == last
+    assert missing(sent, evidence=False) == last
+    assert missing(sent, [m for m in short if m is not taken]) == last + 1
 
 
 def by_sensors(sent: list[Sent]) -> list[Sent]:

@@ -81,7 +81,7 @@ class Door:
         self._subscribers: list[tuple[str, Callable[[str, Sent | bytes], None]]] = []
         self._channels: list[Channel] = []
         self._watches: list[tuple[str, Callable[[str, bool], None]]] = []
-        self._is_for: Callable[[str], bool] = lambda by: True
+        self._is_for: Callable[[str, Duty], bool | None] = lambda by, question: True
         self._answer: Callable[[int, Callable[[Sent], None]], None] | None = None
         self._asked: dict[int, tuple[str, set[Door]]] = {}  # questions: about whom, and who has still to answer
         self._numbers = count()
@@ -104,7 +104,9 @@ class Door:
         self._log.append(Published(self.process.name, sent, self._net.machine.now))
         self._to_subscribers(sent.topic, sent, is_data=True)
 
-    def offer_replay(self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str], bool]) -> None:
+    def offer_replay(
+        self, who: str, since: Callable[[int], Iterable[Sent]], *, is_for: Callable[[str, Duty], bool | None]
+    ) -> None:
         def answer(first: int, reply: Callable[[Sent], None]) -> None:
             for sent in since(first):
                 self._net.machine.pause()
@@ -128,7 +130,9 @@ class Door:
 
         def duty() -> Incoming | None:
             assert self._answer is not None
-            if self._is_for(asker.identity):
+            if (may_ask := self._is_for(asker.identity, duty)) is None:
+                return None
+            if may_ask:
                 self._answer(first, reply)
             self._send(asker, partial(asker._end_question, number, self))
             return None

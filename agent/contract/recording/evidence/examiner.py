@@ -112,6 +112,11 @@ class Examiner:
             unchecked=tuple(self._unchecked(senders)),
         )
 
+    @property
+    def whole(self) -> dict[str, int]:
+        """After `finish`: senders of whom every message that was recorded is there as it was sent, and how many."""
+        return {who: sender.checked for who, sender in self._senders.items() if sender.is_whole}
+
     def _unchecked(self, senders: list[Sender]) -> Iterator[str]:
         if not any(sender.has_evidence for sender in senders):
             yield "no message is checked against its sender: the recording has no evidence"

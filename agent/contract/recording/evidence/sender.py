@@ -85,6 +85,7 @@ class Sender:
         self.absent: set[int] = set()  # numbers that evidence has and the file, so far, has not
         self.unchecked = 0  # messages that there is no evidence for, or that it cannot be held against
         self.is_renumbered = self.has_two_runs = self.has_given_up = False
+        self.is_whole = False  # every message that was recorded is there, and is what was sent
         self._waiting: dict[bytes, list[Seen]] = {}  # by the bytes of their digest that evidence will have
         self._blocks: dict[int, Block] = {}  # by their first number
         self._next, self._head = 0, FIRST_HEAD  # the number after the last block, and the head there
@@ -188,6 +189,8 @@ class Sender:
             for seen, number in self._moves.named:
                 detail = f"exchanged: it was sent as number {number}"
                 self._accuse(Finding("exchanged", self.who, seen.number, seen.topic, seen.step, detail))
+
+        self.is_whole = not self.total and self.checked == sent
 
     def absences(self) -> Absent:
         """What is absent, for Findings."""
