@@ -35,8 +35,8 @@ from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
 from designer.gain.exact import Operator
 from designer.gain.noise import steady_state
+from designer.gain.start import left_by_start
 from designer.model.error_model import error_model, measurement_slices, stacked_gains
-from designer.start import left_by_start
 from designer.workers import each
 
 CONFIDENCE = 0.99  # that the intervals of all steps hold at once

@@ -18,8 +18,6 @@ from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, Make, Prover
 from designer.proof.recursion import MOST_STEPS
 
-_ROUNDED = 1e-6  # relative: room for a proof
-
 
 def verify(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Verdict:
     """Prove all that the gains file claims, from everything as it stands in it. InputError: there is none to be read.
@@ -74,38 +72,6 @@ def lyapunov_matrix(gains: Gains) -> Array:
             rows = slice(p + i * nx, p + (i + 1) * nx)
             P[s, rows, rows] = _stored((certificate.Q or {}).get(mode), node, f'Q of mode "{mode}", node "{node}",', nx)
     return P
-
-
-def single_run(gains: Gains) -> tuple[float, Array] | None:
-    """The least gamma that the certificate's P proves by (17) and (18), and P: for what holds of single runs.
-
-    V = eta'P(r)eta minus the energy so far is a supermartingale by (17), and |z_tilde|^2 <= gamma^2 V by (18), so the
-    inequality of Ville bounds how often |z_tilde| is large. A certificate of kind "exact" proves a smaller gamma by
-    other means, which says nothing of single runs; its P is taken all the same. None where there is no such P.
-    """
-    if gains.certificate.by_theorem1 is not None:
-        return gains.certificate.by_theorem1, lyapunov_matrix(gains)
-    try:
-        return least_of_P(gains.problem, prover_of(gains))
-    except InputError:
-        return None
-
-
-def least_of_P(problem: Problem, prover: Prover) -> tuple[float, Array] | None:
-    """The least gamma with (17) and (18) for the P of a prover, proved, and P; or None."""
-    p, P = problem.plant_states, prover.P
-    if P is None:
-        return None
-    try:
-        M = np.zeros((problem.n * problem.nz, P.shape[1]))
-        M[:, p:] = np.kron(np.diag(problem.weights), problem.plant.M)
-        square = max(np.linalg.eigvalsh(M @ np.linalg.solve((P_s + P_s.T) / 2.0, M.T))[-1] for P_s in P)
-    except np.linalg.LinAlgError:
-        return None
-    if not 0.0 < square < np.inf:
-        return None
-    gamma = float(np.sqrt(square) * (1.0 + _ROUNDED))
-    return (gamma, P) if prover.theorem1(gamma).holds else None
 
 
 def _refuse_other_matrices(problem: Problem, certificate: Certificate) -> None:

@@ -14,12 +14,14 @@ from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
 from agent.contract.problem.disturbance import White
 from designer.beyond_gamma import BeyondGamma, beyond_gamma
+from designer.gain.start import left_by_start
 from designer.ladder import ladder_of
 from designer.replay import Report, judge
 from designer.replay.log import Log, load
 from designer.replay.trace import Trace
 from designer.replay.verdict import Verdict
-from designer.start import left_by_start, value_of
+from designer.single_run import single_run
+from designer.start import value_of
 
 SETTLED = 0.01  # of the largest value: what stays below it to the end need not be seen
 MOST_OF_A_RUN = 0.8  # a part of it is worth a picture of its own only where it is shorter than that
@@ -117,8 +119,6 @@ class Account:
         """None where the gains have no proved P, or errors are not known."""
         if self.mean_bound is None:
             return None
-        from designer.proof.certificate import single_run  # it loads ball arithmetic
-
         known = single_run(self.log.gains)
         if known is None:
             return None
