@@ -26,7 +26,7 @@ PENDULUM, LOSSY = find("inverted-pendulum"), find("zhu2020-lossy")
 
 
 def begun(problem: Problem, *error: float) -> Problem:
-    return problem.with_(name="begun", plant={"initial_error": list(error)}, disturbance={"kind": "quiet"})
+    return problem.with_(name="begun", plant={"initial_error": list(error)}, disturbance={"kind": "none"})
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +62,7 @@ def test_where_a_corner_is_worse_than_the_given_one_it_counts() -> None:
         C={"a": [[1.0, -1.0]]},
         D={"a": [[0.1]]},
         adjacency={"on": [[1.0]]},
-        plant={"initial_error": [1.0, -1.0]},
-    )
+    ).with_(plant={"initial_error": [1.0, -1.0]})
     K, H = {"on": {"a": {"a": np.diag([0.5, 0.5])}}}, {"on": {"a": {"a": np.zeros((2, 1))}}}
     assert left_by_start(problem, K, H) == 2.0
     P = np.array([[[1.0, 0.25, 0.0, 0.0], [0.25, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
@@ -81,7 +80,7 @@ def test_the_bound_of_17_and_18_holds_for_the_mean_over_runs(gains: Gains) -> No
     assert ensemble.start == start.alone
     assert ensemble.refuted_at is None
     assert ensemble.mean.max() <= start.gamma_P**2 * start.V
-    assert ensemble.mean.max() <= ensemble.bound.max()
+    assert ensemble.mean.max() <= ensemble.bound.max() * (1.0 + 1e-12)
     assert "proved by (17) and (18)" in "\n".join(told(start.document()))
 
 
