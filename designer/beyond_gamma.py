@@ -16,6 +16,8 @@ from designer.gain.exact import node_gains
 from designer.gain.noise import SteadyState, steady_state
 from designer.ladder import rounded_up
 from designer.model.error_model import error_model, stacked_links
+from designer.start import FromStart, from_start
+from designer.start import told as from_there
 
 _MOST_STATES = 40  # n nx up to which the gain of each node is worth its time
 _FEW = 8  # nodes that get a line each; of more, as many
@@ -28,6 +30,7 @@ class BeyondGamma(NamedTuple):
     weights: Array  # (n,)
     noise: SteadyState | None
     gains: list[tuple[float, float]] | None  # of every node's own error
+    start: FromStart | None = None  # None: the problem has no initial error
 
     def document(self) -> dict[str, Any]:
         """For --json."""
@@ -41,25 +44,28 @@ class BeyondGamma(NamedTuple):
                 "nodes": dict(zip(self.names, (noise.nodes / self.weights**2).tolist(), strict=True)),
                 "relative_error": noise.error,
             },
+            "start": None if self.start is None else self.start.document(),
             "node_gains": None
             if gains is None
             else dict(zip(self.names, (np.array(gains) / self.weights[:, None]).tolist(), strict=True)),
         }
 
 
-def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> BeyondGamma:
-    """For any gains; nothing is computed where the errors are not mean-square stable."""
+def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | None = None) -> BeyondGamma:
+    """For any gains, with the P that their certificate stores; nothing where they are not mean-square stable."""
     model = error_model(problem, *stacked_links(problem, K, H))
     noise = steady_state(model, initial=problem.mode_index(problem.markov.initial))
     small = problem.n * problem.nx <= _MOST_STATES
-    return BeyondGamma(problem.node_names, problem.weights, noise, node_gains(model) if small else None)
+    return BeyondGamma(
+        problem.node_names, problem.weights, noise, node_gains(model) if small else None, from_start(problem, K, H, P)
+    )
 
 
 def told(facts: dict[str, Any]) -> list[str]:
     """`BeyondGamma.document` for people: the noise, then a line for each node, of many for those that have most."""
     noise, gains = facts["white_noise"], facts["node_gains"] or {}
     if noise is None:
-        return ["noise      what white w leaves in the steady state was not found"]
+        return ["noise      what white w leaves in the steady state was not found", *from_there(facts.get("start"))]
     found = [f"noise      E|z~|^2 = {noise['mean_square']:.6g} in the steady state under white w of unit covariance"]
     order = sorted(noise["nodes"], key=lambda name: -noise["nodes"][name])
     names = list(noise["nodes"]) if len(order) <= _FEW else order[:_FEW]
@@ -69,4 +75,4 @@ def told(facts: dict[str, Any]) -> list[str]:
         found.append(f"  node {name:{width}}  {gain}E|z - z^|^2 = {noise['nodes'][name]:.6g}; computed")
     if len(order) > _FEW:
         found.append(f"  and {len(order) - _FEW} nodes with less noise: --json has all")
-    return found
+    return found + from_there(facts.get("start"))

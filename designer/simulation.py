@@ -35,6 +35,7 @@ from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
 from designer.gain.exact import Operator
 from designer.gain.noise import steady_state
+from designer.gain.start import left_by_start
 from designer.model.error_model import error_model, measurement_slices, stacked_gains
 from designer.workers import each
 
@@ -76,6 +77,7 @@ class Network:
     rho: Array  # (links,)
     cumulative: Array  # (modes, modes): Pi, summed along its rows
     initial: int
+    x: Array  # (nx,): at the first step, and so are the errors
     w: Array | float  # w(0), w(1), ..., (steps, nw), or the deviation of white noise
 
 
@@ -125,11 +127,14 @@ class Ensemble:
     energy: Array  # mean energy of w before the step, known exactly
     rounding: Array  # sqrt E|z_tilde(k)|^2 that rounding may have made; 0 where nothing depends on it
     peaks: Array  # (runs,): max over k of |z_tilde(k)| of single runs
+    start: float = 0.0  # sqrt E|z_tilde(k)|^2 that the initial error alone leaves at most
 
     @property
     def bound(self) -> Array:
-        """gamma^2 energy."""
-        return self.gamma**2 * self.energy
+        """gamma^2 energy; with an initial error (gamma sqrt(energy) + start)^2."""
+        return np.asarray(
+            (self.gamma * np.sqrt(self.energy) + self.start) ** 2 if self.start else self.gamma**2 * self.energy
+        )
 
     @property
     def closest(self) -> int | None:
@@ -172,7 +177,10 @@ def simulate(
         if progress is not None:
             progress(found.runs)
     assert found is not None
-    ensemble = _ensemble(gains.certificate.gamma, found, _energy(network, steps))
+    start = left_by_start(gains.problem, gains.K, gains.H) if network.x.any() else 0.0
+    if start is None:
+        raise InputError(f"what the initial error of {gains.problem.name} leaves at most was not found")
+    ensemble = _ensemble(gains.certificate.gamma, found, _energy(network, steps), start)
     if ensemble.refuted_at is None:
         return ensemble
     return replace(ensemble, rounding=_rounding(gains, network, found))
@@ -217,6 +225,7 @@ def network_of(gains: Gains, *, steps: int, w: Array | None = None) -> Network:
         rho=np.array([link.delivery_probability for link in problem.links or ()]),
         cumulative=cumulative / cumulative[:, -1:],
         initial=problem.mode_index(problem.markov.initial),
+        x=problem.initial_error,
         w=_disturbance(gains, steps) if w is None else _padded(w, steps),
     )
 
@@ -337,10 +346,11 @@ def _together(one: Tally, other: Tally, ignored: int) -> Tally:
 
 
 def states(network: Network, seeds: Sequence[int], *, steps: int) -> Iterator[State]:
-    """The states of steps 0, 1, ..., steps - 1 of the runs with these seeds, from x = 0 and e = 0."""
+    """The states of steps 0, 1, ..., steps - 1 of the runs with these seeds, from the initial error on."""
     runs, owner, hidden = len(seeds), network.owner, ~network.seen
     r = np.full(runs, network.initial)
-    x, e = np.zeros((runs, len(network.A))), np.zeros((runs, network.Ce.shape[1]))
+    x = np.tile(network.x, (runs, 1))
+    e = np.tile(x, network.Ce.shape[1] // x.shape[1])
     for mode_draw, theta, delivered, w in _draws(network, seeds, steps):
         yield State(r, x, e, w)
         arrived = theta[:, owner].astype(np.float64)
@@ -397,7 +407,7 @@ def _draws(network: Network, seeds: Sequence[int], steps: int) -> Iterator[Draws
             yield Draws(uniform[MODES][k], uniform[LOSSES][k] < network.beta, uniform[DELIVERIES][k] < network.rho, w)
 
 
-def _ensemble(gamma: float, found: Tally, energy: Array) -> Ensemble:
+def _ensemble(gamma: float, found: Tally, energy: Array, start: float) -> Ensemble:
     runs, steps = found.runs, len(found.mean)
     quantile = NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * steps))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -405,4 +415,4 @@ def _ensemble(gamma: float, found: Tally, energy: Array) -> Ensemble:
         mean = np.where(np.isnan(found.mean), np.inf, found.mean)
         low = np.where(np.isnan(half), 0.0, np.maximum(mean - half, 0.0))
         high = np.where(np.isnan(half), np.inf, mean + half)
-    return Ensemble(gamma, mean, low, high, found.others / runs, energy, np.zeros(steps), found.peaks)
+    return Ensemble(gamma, mean, low, high, found.others / runs, energy, np.zeros(steps), found.peaks, start)

@@ -65,6 +65,18 @@ def _matrix(value: Any) -> Array:
 Matrix = Annotated[Array, PlainValidator(_matrix), PlainSerializer(lambda array: array.tolist())]
 
 
+def _vector(value: Any) -> Array:
+    """A (length,) array from a non-empty list of finite numbers."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not (isinstance(value, list) and value and not any(isinstance(entry, list) for entry in value)):
+        raise ValueError(f"must be a list of numbers such as [0.1, 0.0], got {shortened(value)}")
+    return read_only(_matrix([value])[0])
+
+
+Vector = Annotated[Array, PlainValidator(_vector), PlainSerializer(lambda array: array.tolist())]
+
+
 def ulps(a: float, b: float) -> int:
     """How many float64 numbers lie from one to the other: 0 for equal bits, 1 for neighbours, and for 0.0 and -0.0."""
     return abs(_place(a) - _place(b))

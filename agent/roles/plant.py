@@ -59,13 +59,13 @@ def run(bus: Bus, gains: Gains) -> None:
 
 
 class SimulatedPlant:
-    """x(k) from zero, and what every sensor delivers of it."""
+    """x(k) from the initial error, and what every sensor delivers of it."""
 
     def __init__(self, problem: Problem, *, seed: int, worst_case: Array | None = None) -> None:
         self._problem = problem
         self._losses = Losses(problem, seed=seed)
         self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=worst_case)
-        self._x = np.zeros(problem.nx)
+        self._x = problem.initial_error
         self.step = 0  # the next one
 
     def skip_to(self, step: int) -> None:

@@ -150,6 +150,7 @@ def design_and_save(
     from designer.beyond_gamma import beyond_gamma
     from designer.diagnosis import warnings
     from designer.ladder import ladder_of
+    from designer.proof.certificate import stored_P
     from designer.search.effort import BUDGET
     from designer.synthesis import design  # only now: it loads a solver
 
@@ -180,7 +181,7 @@ def design_and_save(
         "exact": proved.exact,
         "floor": proved.floor,
         "ladder": ladder_of(gains).document(),
-        **beyond_gamma(problem, gains.K, gains.H).document(),
+        **beyond_gamma(problem, gains.K, gains.H, stored_P(gains)).document(),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,

@@ -130,6 +130,7 @@ def _facts(ensemble: Ensemble) -> dict[str, Any]:
     return {
         "gamma": ensemble.gamma,
         "confidence": CONFIDENCE,
+        "start": ensemble.start,
         "peak": _step(ensemble, int(np.argmax(ensemble.mean))),
         "closest": None if closest is None else _step(ensemble, closest),
         "gain": None if closest is None else float(np.sqrt(ensemble.mean[closest] / ensemble.energy[closest])),
@@ -165,6 +166,9 @@ def _text(facts: dict[str, Any]) -> str:
         f"disturbance {facts['disturbance']}, {facts['seconds']:.1f} s",
         f"peak       {_interval(peak)}",
     ]
+    if facts["start"]:
+        lines += [f"start      the initial error alone leaves {facts['start']:.6g} of sqrt(E|z~|^2) at most, computed"]
+        lines += ["           so the bound is (gamma sqrt(energy) + that)^2"]
     if facts["steady"] is not None:
         lines += [f"steady     mean |z~|^2 = {facts['steady']:.6g} in the long run, computed from this white noise"]
     if closest is None:

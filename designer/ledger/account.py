@@ -9,11 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.contract.arrays import Array
 from agent.contract.errors import counted
 from agent.contract.gains import Gains
+from agent.contract.problem import Problem
 from designer.ledger.deviation import Deviation
 from designer.ledger.exact import Ledger
 from designer.ledger.promise import SHARE, Promise
+from designer.model.error_model import initial_eta
 
 Flags = NDArray[np.bool_]
 _LOOKS = 24  # gains that are searched along a run with faults; a search takes up to a tenth of a second
@@ -84,6 +87,27 @@ def deviations(substituted: Flags, unmeasured: Flags, absent: Flags, origin: NDA
     return found
 
 
+class Beginning(NamedTuple):
+    """What is there before anything has happened, for a ledger that stands at the first step."""
+
+    covariance: Array  # (modes, n_eta, n_eta)
+    what: str
+    is_unit: bool
+
+    def told(self, ledger: Ledger) -> None:
+        ledger.jump(self.covariance, self.what, is_unit=self.is_unit)
+
+
+def beginning(problem: Problem, *, unknown: bool) -> Beginning | None:
+    """The initial error of the problem, or one that is `unknown`; None where there is none."""
+    size = problem.plant_states + problem.n * problem.nx
+    known, covariance = initial_eta(problem), np.zeros((len(problem.mode_names), size, size))
+    if not unknown and not known.any():
+        return None
+    covariance[problem.mode_index(problem.markov.initial)] = np.eye(size) if unknown else np.outer(known, known)
+    return Beginning(covariance, _AS_IT_WAS if unknown else "the initial error", unknown)
+
+
 def account(
     gains: Gains,
     *,
@@ -100,14 +124,12 @@ def account(
     if void is not None:
         promise = Promise("void", gains.certificate.gamma, math.inf, None, (), *void)
         return Account(promise, steps, len(faults), None, 0, 0)
-    if not faults and not starts_anywhere:
+    start = beginning(gains.problem, unknown=starts_anywhere)
+    if not faults and start is None:
         return Account(Promise("valid", gains.certificate.gamma, 1.0, 0, (), "", None), steps, 0, None, 0, 0)
     ledger, looks = Ledger.of(gains), _looks(faults, steps)
-    if starts_anywhere:
-        size, modes = ledger.models.designed.size, len(gains.problem.mode_names)
-        start = np.zeros((modes, size, size))
-        start[gains.problem.mode_index(gains.problem.markov.initial)] = np.eye(size)
-        ledger.jump(start, _AS_IT_WAS, is_unit=True)
+    if start is not None:
+        start.told(ledger)
     worst, worst_step = None, 0
     for k in range(steps):
         if k in faults:

@@ -240,6 +240,11 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
     )
 
 
+def initial_eta(problem: Problem) -> Array:
+    """eta(0), (n_eta,), where x(0) is the initial error and every node begins with 0."""
+    return np.tile(problem.initial_error, problem.n + (1 if problem.plant_states else 0))
+
+
 def _taken_by_losses(problem: Problem, bar: Stacks, p: int) -> Array:
     """What a loss takes from each innovation, (sum ny, n_eta + nw): C_i x, or where it is seen C_i e_i + D_i w."""
     nx, size = problem.nx, p + problem.n * problem.nx

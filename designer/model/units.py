@@ -114,6 +114,7 @@ def rescaled(problem: Problem, units: Units) -> Problem:
             "A": plant.A * columns / rows,
             "B": plant.B / rows,
             "M": plant.M * columns / units.output,
+            "initial_error": None if plant.initial_error is None else plant.initial_error / columns,
         }
     )
     nodes = tuple(node.model_copy(update={"C": node.C * columns}) for node in problem.nodes)

@@ -48,8 +48,12 @@ def _with_lower_end(claim: Certificate, prover: Prover, verdict: Verdict) -> Ver
 def prover_of(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Prover:
     """For the gains as they are, and the P of their certificate; or its own where that stores none."""
     _refuse_other_matrices(gains.problem, gains.certificate)
-    P = None if gains.certificate.form == "summed" else lyapunov_matrix(gains)
-    return Prover(gains.problem, gains.K, gains.H, P=P, makes=makes)
+    return Prover(gains.problem, gains.K, gains.H, P=stored_P(gains), makes=makes)
+
+
+def stored_P(gains: Gains) -> Array | None:
+    """`lyapunov_matrix`; None where the certificate stores none."""
+    return None if gains.certificate.form == "summed" else lyapunov_matrix(gains)
 
 
 def lyapunov_matrix(gains: Gains) -> Array:

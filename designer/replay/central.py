@@ -90,6 +90,11 @@ class Central:
                 rows[:, columns[here]] |= V_l[:, here] != 0.0
         return np.asarray(touches, dtype=np.float64)
 
+    def start(self, has_plant: bool) -> tuple[Array, Array]:
+        """x(0) and eta(0), (nx,) and (n_eta,): where the plant is not known, x counts as 0 throughout."""
+        x = self.problem.initial_error if has_plant else np.zeros(self.problem.nx)
+        return x, np.tile(x, self.model.size // self.problem.nx)
+
     def owner(self, width: int) -> Numbers:
         """The node of each column of a stacked vector with `width` numbers for each node."""
         return np.repeat(np.arange(self.problem.n), width)

@@ -126,7 +126,9 @@ class Coupling:
         log, central, inputs = self.log, self.central, self.inputs
         model, p, size = central.model, central.model.plant_states, central.model.size
         absent, nx = self.absent(), central.problem.nx
-        x, eta, covariances, diagonal = np.zeros(nx), np.zeros(size), np.zeros((2, size, size)), np.arange(size)
+        x, eta = central.start(log.has_plant)
+        covariances, start, diagonal = np.zeros((2, size, size)), eta, np.arange(size)
+        covariances[1] = np.diag(eta**2)
         for first in range(0, log.steps, block):
             steps = range(first, min(first + block, log.steps))
             keys = self.keys(steps)
@@ -143,18 +145,19 @@ class Coupling:
             now = slice(steps.start, steps.stop)
             x_hat = np.where(np.isnan(log.x_hat[now]), np.tile(xs, central.problem.n) - etas[:, p:], log.x_hat[now])
             squares = self.magnitude(now, xs, x_hat) ** 2
-            outputs = np.empty((len(steps), len(model.M), len(model.M)))
+            outputs, starts = np.empty((len(steps), len(model.M), len(model.M))), np.empty(len(steps))
             for row, k in enumerate(steps):
                 step = self.acted(keys[row])
                 if (jump := jumps[row]) is not None:
-                    covariances = jump @ covariances @ jump.T
+                    covariances, start = jump @ covariances @ jump.T, jump @ start
                 M = model.M * ~np.repeat(absent[k], central.problem.nz)[:, None]
                 outputs[row] = M @ covariances[0] @ M.T
-                reach[row] = covariances[1, diagonal, diagonal] * ((first + row) * size)
+                starts[row], start = np.linalg.norm(M @ start), step.A @ start
+                reach[row] = covariances[1, diagonal, diagonal] * (max(first + row, 1) * size)
                 covariances = step.A @ covariances @ step.A.T
                 covariances[0] += step.B @ step.B.T
                 covariances[1, diagonal, diagonal] += squares[row]
-            yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), free_run.largest(outputs))
+            yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), free_run.largest(outputs), starts)
 
     def error_norms(self) -> Array:
         """|z_tilde(k)| over the nodes that are there, (steps,)."""
@@ -209,7 +212,7 @@ def with_the_plant(log: Log, drawn: Drawn) -> Log:
     plant = log.gains.problem.plant
     x, w = log.x.copy(), np.where(np.isnan(log.w), drawn.w, log.w)
     for k in np.flatnonzero(np.isnan(x).any(axis=1)):
-        x[k] = plant.A @ x[k - 1] + plant.B @ w[k - 1] if k else 0.0
+        x[k] = plant.A @ x[k - 1] + plant.B @ w[k - 1] if k else log.gains.problem.initial_error
     return replace(log, x=x, w=w, z=np.where(np.isnan(log.z), x @ plant.M.T, log.z))
 
 

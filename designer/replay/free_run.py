@@ -28,10 +28,11 @@ class FreeBlock(NamedTuple):
     """The free run at the steps `first`, `first` + 1, ..."""
 
     first: int
-    x: Array  # (steps, nx): the plant from x(0) = 0
-    eta: Array  # (steps, n_eta): eta(k) from eta(0) = 0 by (10)
+    x: Array  # (steps, nx): the plant from x(0)
+    eta: Array  # (steps, n_eta): eta(k) from eta(0) by (10)
     reach: Array  # (steps, n_eta): a relative rounding error of t in every step so far moves eta by t reach at most
     path: Array  # (steps,): gamma_path(k), nan where it overflowed
+    start: Array  # (steps,): |M eta(k)| without w
 
 
 def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs:
@@ -46,7 +47,7 @@ def complete(inputs: Inputs, drawn: Drawn, log: Log, central: Central) -> Inputs
 
 
 def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Iterator[FreeBlock]:
-    """eta(k+1) = script A_k eta(k) + script B_k w(k) from eta(0) = 0, with two covariances beside it.
+    """eta(k+1) = script A_k eta(k) + script B_k w(k) from eta(0), with two covariances beside it.
 
     Path gain: X(k+1) = A_k X(k) A_k' + B_k B_k' from X(0) = 0 gives
     gamma_path(k)^2 = lambda_max(M X(k) M'). It is carried as a factor, X = S S' with S(k+1) = [A_k S(k), B_k], so that
@@ -64,7 +65,8 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
         AB = realised(model, s, np.frombuffer(theta), delivered)
         return Realised(AB[:, :size], AB[:, size:], _delivered_gains(central, s, delivered))
 
-    x, eta, Y, diagonal = np.zeros(len(plant.A)), np.zeros(size), np.zeros((size, size)), np.arange(size)
+    x, eta = central.start(log.has_plant)
+    start, Y, diagonal = eta, np.diag(eta**2), np.arange(size)
     S = np.zeros((size, 0))
     for first in range(0, log.steps, block):
         steps = range(first, min(first + block, log.steps))
@@ -77,16 +79,17 @@ def free_run(log: Log, central: Central, inputs: Inputs, *, block: int) -> Itera
             eta[p:] -= of_step.H @ inputs.u[k]
             x = eta[:p] if p else plant.A @ x + plant.B @ inputs.w[k]
         squares = _magnitudes(log, central, inputs, xs, etas, first) ** 2
-        outputs = np.empty((len(steps), len(model.M), len(model.M)))
+        outputs, starts = np.empty((len(steps), len(model.M), len(model.M))), np.empty(len(steps))
         for row in range(len(steps)):
             A_k, B_k, _ = transition(*keys[row])
             F = model.M @ S
             outputs[row] = F @ F.T
-            reach[row] = Y[diagonal, diagonal] * ((first + row) * size)
+            starts[row], start = np.linalg.norm(model.M @ start), A_k @ start
+            reach[row] = Y[diagonal, diagonal] * (max(first + row, 1) * size)
             S = _short(np.hstack([A_k @ S, B_k]))
             Y = A_k @ Y @ A_k.T
             Y[diagonal, diagonal] += squares[row]
-        yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), largest(outputs))
+        yield FreeBlock(first, xs, etas, np.sqrt(np.maximum(reach, FLOOR**2)), largest(outputs), starts)
 
 
 def _short(S: Array) -> Array:
@@ -113,7 +116,7 @@ def free_check(log: Log, central: Central, block: FreeBlock) -> Check:
 
 
 class Path(NamedTuple):
-    """Proof 5 over one block: |z_tilde(k)|^2 <= gamma_path(k)^2 sum over j < k of |w(j)|^2.
+    """Proof 5 over one block: |z_tilde(k)| <= gamma_path(k) (sum over j < k of |w(j)|^2)^(1/2) + what x(0) leaves.
 
     At step 1 it reads |M B w(0)| <= |M B| |w(0)| with the B of the first step, so it is an equality where w is one
     number. Later gamma_path(k) |w(0), ..., w(k-1)| is attained by one direction of that vector alone.
@@ -121,7 +124,7 @@ class Path(NamedTuple):
 
     first: int
     error: Array  # (steps,): |z_tilde(k)|, as logged; nan where a message is missing
-    bound: Array  # (steps,): gamma_path(k) sqrt(energy of the steps before)
+    bound: Array  # (steps,): gamma_path(k) sqrt(energy of the steps before), and |M eta(k)| without w
     rounding: Array  # (steps,): a relative rounding error of t in every step moves the error by t times this
 
 
@@ -129,7 +132,7 @@ def path_block(central: Central, block: FreeBlock, errors: Array, energy_before:
     """`errors` (all steps) are |z_tilde(k)|; `energy_before` (all steps) is the sum over j < k of |w(j)|^2."""
     steps = slice(block.first, block.first + len(block.eta))
     rounding = np.linalg.norm(block.reach @ np.abs(central.model.M).T, axis=1)
-    return Path(block.first, errors[steps], block.path * np.sqrt(energy_before[steps]), rounding)
+    return Path(block.first, errors[steps], block.path * np.sqrt(energy_before[steps]) + block.start, rounding)
 
 
 def _magnitudes(log: Log, central: Central, inputs: Inputs, x: Array, eta: Array, first: int) -> Array:

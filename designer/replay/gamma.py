@@ -16,6 +16,7 @@ class Gamma:
     value: float
     is_claimed: bool
     failure: str | None  # why it is not proved
+    has_start: bool = False  # the problem has an initial error
     is_checked: bool = True  # what is needed for that is installed
 
     def text(self) -> str:
@@ -25,15 +26,16 @@ class Gamma:
             return f"certificate  NOT CHECKED: {self.failure}; whether gamma is proved for these gains is not known"
         if self.failure is not None:
             return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
+        start = "beside what the initial error leaves" if self.has_start else "from zero initial error"
         return (
             "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes, losses "
-            "and deliveries, from zero initial error; one run may exceed it"
+            f"and deliveries, {start}; one run may exceed it"
         )
 
 
 def checked_gamma(gains: Gains) -> Gamma:
     """What the gains claim, proved again from their own numbers."""
-    claim = gains.certificate
+    claim, has_start = gains.certificate, gains.problem.plant.initial_error is not None
     if not claim.holds:
         return Gamma(claim.gamma, is_claimed=False, failure="gamma is not claimed")
     from designer.proof.certificate import verify  # it loads ball arithmetic, which nothing else of a replay needs
@@ -45,4 +47,4 @@ def checked_gamma(gains: Gains) -> Gamma:
         if isinstance(error.__cause__, ModuleNotFoundError):
             return Gamma(claim.gamma, is_claimed=True, failure=str(error), is_checked=False)
         failure = str(error)
-    return Gamma(claim.gamma, is_claimed=True, failure=failure)
+    return Gamma(claim.gamma, is_claimed=True, failure=failure, has_start=has_start)

@@ -69,10 +69,10 @@ def names(field: str, first: int, owner: Numbers, logged: Numbers, expected: Num
 
 
 def start_checks(log: Log, central: Central) -> Iterator[Check]:
-    """x(0) = 0 and x_hat_i(0) = 0."""
+    """x(0) is the initial error, 0 where the problem has none, and x_hat_i(0) = 0."""
     x, x_hat = log.x[:1], log.x_hat[:1]
     plant = np.full(x.shape[1], -1)
-    yield numbers(1, "x", 0, plant, x, np.zeros_like(x), np.abs(x))
+    yield numbers(1, "x", 0, plant, x, central.problem.initial_error[None], np.abs(x))
     yield numbers(1, "x_hat", 0, central.owner(central.problem.nx), x_hat, np.zeros_like(x_hat), np.abs(x_hat))
 
 

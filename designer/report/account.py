@@ -11,28 +11,29 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from agent.contract.errors import InputError, RunBroken
-from agent.contract.gains import Gains
+from agent.contract.errors import RunBroken
 from agent.contract.problem.disturbance import White
 from designer.beyond_gamma import BeyondGamma, beyond_gamma
+from designer.gain.start import left_by_start
 from designer.ladder import ladder_of
 from designer.replay import Report, judge
 from designer.replay.log import Log, load
 from designer.replay.trace import Trace
 from designer.replay.verdict import Verdict
+from designer.single_run import single_run
+from designer.start import value_of
 
 SETTLED = 0.01  # of the largest value: what stays below it to the end need not be seen
 MOST_OF_A_RUN = 0.8  # a part of it is worth a picture of its own only where it is shorter than that
 CONFIDENCE = 0.95  # of the bound that single runs keep
 THIS_RUN = "this run: largest error / root of the energy"
-_ROUNDED = 1e-6  # relative: room for a proof
 
 
 class Chance(NamedTuple):
-    """What single runs keep with a probability: P(sup_k |z_tilde(k)| >= c) <= gamma^2 E sum |w|^2 / c^2."""
+    """What single runs keep with a probability: P(sup_k |z_tilde(k)| >= c) <= gamma^2 (E sum |w|^2 + V) / c^2."""
 
     gamma: float  # of a P with (17) and (18) of Theorem 1
-    energy: float  # E sum |w|^2 before the last step
+    energy: float  # E sum |w|^2 before the last step, and V = eta(0)'P eta(0)
 
     def level(self, confidence: float = CONFIDENCE) -> float:
         """The c below which |z_tilde| stays at every step of a run with this probability at least."""
@@ -102,27 +103,31 @@ class Account:
 
     @cached_property
     def mean_bound(self) -> Array | None:
-        """gamma sqrt(sum over j < k of |w(j)|^2), (steps,).
+        """gamma sqrt(sum over j < k of |w(j)|^2), and what x(0) leaves, (steps,).
 
         None where gamma is not proved, says less of this run than of any (faults, say), or errors are not known.
         """
         if self.verdict.gamma.failure is not None or not self.is_as_promised or not self.log.has_plant:
             return None
-        return np.asarray(self.verdict.gamma.value * np.sqrt(self.trace.energy_before))
+        start = left_by_start(self.log.gains.problem, self.log.gains.K, self.log.gains.H)
+        if start is None:
+            return None
+        return np.asarray(self.verdict.gamma.value * np.sqrt(self.trace.energy_before) + start)
 
     @cached_property
     def chance(self) -> Chance | None:
         """None where the gains have no proved P, or errors are not known."""
         if self.mean_bound is None:
             return None
-        gamma = single_run_gamma(self.log.gains)
-        if gamma is None:
+        known = single_run(self.log.gains)
+        if known is None:
             return None
         disturbance, before = self.log.gains.problem.disturbance, self.log.steps - 1
         energy = float(self.trace.energy_before[-1])
         if isinstance(disturbance, White):
             energy = before * self.log.gains.problem.nw * disturbance.deviation**2
-        return Chance(gamma, energy)
+        gamma, P = known
+        return Chance(gamma, energy + value_of(self.log.gains.problem, P))
 
     @cached_property
     def lost(self) -> Array:
@@ -169,34 +174,6 @@ class Account:
         """The part of all steps that each mode had, (modes,)."""
         counts = np.bincount(self.log.mode[self.log.mode >= 0], minlength=len(self.log.gains.problem.topologies))
         return np.asarray(counts[: len(self.log.gains.problem.topologies)] / max(1, self.log.steps))
-
-
-def single_run_gamma(gains: Gains) -> float | None:
-    """The least gamma that the certificate's P proves by (17) and (18), for what holds of single runs.
-
-    V = eta'P(r)eta minus the energy so far is a supermartingale by (17), and |z_tilde|^2 <= gamma^2 V by (18), so the
-    inequality of Ville gives `Chance`. A certificate of kind "exact" proves a smaller gamma by other means, which says
-    nothing of single runs; its P is taken all the same. None where there is no such P.
-    """
-    from designer.proof.certificate import prover_of  # it loads ball arithmetic
-
-    if gains.certificate.by_theorem1 is not None:
-        return gains.certificate.by_theorem1
-    p = gains.problem.plant_states
-    try:
-        prover = prover_of(gains)
-        P = prover.P
-        if P is None:
-            return None
-        M = np.zeros((gains.problem.n * gains.problem.nz, P.shape[1]))
-        M[:, p:] = np.kron(np.diag(gains.problem.weights), gains.problem.plant.M)
-        square = max(np.linalg.eigvalsh(M @ np.linalg.solve((P_s + P_s.T) / 2.0, M.T))[-1] for P_s in P)
-    except (InputError, np.linalg.LinAlgError):
-        return None
-    if not 0.0 < square < np.inf:
-        return None
-    gamma = float(np.sqrt(square) * (1.0 + _ROUNDED))
-    return gamma if prover.theorem1(gamma).holds else None
 
 
 def over_nodes(statistic: Callable[..., Array], values: Array) -> Array:

@@ -20,6 +20,7 @@ from agent.contract.gains import Gains
 from agent.contract.messages import ZERO_STATE, Control, Estimate
 from agent.contract.problem import Problem
 from agent.contract.schedule import Deliveries
+from designer.ledger.account import beginning
 from designer.ledger.deviation import AS_DESIGNED, Deviation
 from designer.ledger.exact import Ledger
 from designer.ledger.promise import Promise
@@ -204,12 +205,13 @@ class Book:
         self.since = k
         if mode not in names:
             ledger.void(f'mode "{mode}" is none of the chain')
-        elif k or self._starts_anywhere:
+        elif k:
             size = ledger.models.designed.size
             start = np.zeros((len(names), size, size))
             start[names.index(mode)] = np.eye(size)
-            what = f"what was there at step {k}" if k else "the initial error, which is not known"
-            ledger.jump(start, what, is_unit=True)
+            ledger.jump(start, f"what was there at step {k}", is_unit=True)
+        elif (begun := beginning(self._problem, unknown=self._starts_anywhere)) is not None:
+            begun.told(ledger)
         return ledger
 
     def _void_outside_the_chain(self, mode: str) -> None:

@@ -176,6 +176,11 @@ class Problem(Model):
         return int(self.plant.M.shape[0])
 
     @cached_property
+    def initial_error(self) -> Array:
+        """x(0) - x_hat_i(0) of every node, at most, (nx,): a simulated plant begins with it."""
+        return read_only(np.zeros(self.nx) if self.plant.initial_error is None else self.plant.initial_error)
+
+    @cached_property
     def beta(self) -> Array:
         """Arrival probabilities, (n,)."""
         return read_only([node.arrival_probability for node in self.nodes])

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
-from agent.contract.arrays import Matrix, Model, Number, shape_text
+from agent.contract.arrays import Array, Matrix, Model, Number, Vector, shape_text
 from agent.contract.errors import counted, first_fault, listed, shortened
 from agent.contract.problem.sampling import sampled
 from agent.contract.problem.uncertainty import OfChain, OfLink, OfNode, OfPlant, check_shape
@@ -50,6 +50,9 @@ class Plant(Model):
 
     A plant of continuous time has A_continuous, B_continuous and `sample_time`, in one unit of time, in place of A and
     B, which follow from them (`sampling`); a saved problem has both, and they have to agree.
+
+    `initial_error` (nx,): how far each state may be, either way, from 0, which is what the nodes begin with; a
+    simulated plant begins there. None stands for 0.
     """
 
     A: Matrix
@@ -59,6 +62,12 @@ class Plant(Model):
     B_continuous: Matrix | None = None
     sample_time: Number | None = Field(default=None, gt=0.0)
     tolerance: OfPlant | None = None
+    initial_error: Vector | None = None
+
+    @field_validator("initial_error")
+    @classmethod
+    def _none_for_0(cls, value: Array | None) -> Array | None:
+        return None if value is None or not value.any() else value
 
     @model_validator(mode="before")
     @classmethod
@@ -88,6 +97,11 @@ class Plant(Model):
             raise ValueError(f"A is {shape_text(self.A)}; it must be square")
         if self.B.shape[0] != nx:
             raise ValueError(f"B is {shape_text(self.B)}; A is {shape_text(self.A)}, so B needs {counted(nx, 'row')}")
+        if self.initial_error is not None and len(self.initial_error) != nx:
+            raise ValueError(
+                f"initial_error has {counted(len(self.initial_error), 'entry')}; A is {shape_text(self.A)}, so it has "
+                f"{counted(nx, 'entry')}, one for each state"
+            )
         if self.M.shape[1] != nx:
             raise ValueError(
                 f"M is {shape_text(self.M)}; A is {shape_text(self.A)}, so M needs {counted(nx, 'column')}"

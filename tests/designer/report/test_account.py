@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_recordings import observer_gains, random_gains, random_problem, real_problem, record, simulate
-from places import GOLDEN
+from places import GOLDEN, ROOT
 from reports import account_of, recorded
 
 from agent.contract import schedule
@@ -15,7 +15,9 @@ from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
 from designer.problems import find
 from designer.proof.certificate import prover_of
-from designer.report.account import Account, Chance, over_nodes, single_run_gamma
+from designer.proof.prover import Prover
+from designer.report.account import Account, Chance, over_nodes
+from designer.single_run import least_of_P, single_run
 from designer.synthesis import design
 
 GOLDEN_RUN = GOLDEN / "zhu2020-lossy.mcap"
@@ -117,8 +119,10 @@ def exact() -> Gains:
 
 def test_of_an_exact_certificate_it_is_the_least_gamma_that_its_matrix_proves(exact: Gains) -> None:
     """It is not below the exact gain, which says nothing of single runs; of a thousandth less (18) is not proved."""
-    gamma, prover = single_run_gamma(exact), prover_of(exact)
-    assert gamma is not None
+    known = single_run(exact)
+    assert known is not None
+    gamma, P = known
+    prover = Prover(exact.problem, exact.K, exact.H, P=P)
     assert exact.certificate.exact is not None
     assert gamma >= exact.certificate.exact[0]
     assert prover.theorem1(gamma).holds
@@ -127,9 +131,19 @@ def test_of_an_exact_certificate_it_is_the_least_gamma_that_its_matrix_proves(ex
     assert "(18) fails" in less.failure
 
 
+def test_it_is_far_below_what_the_matrix_that_ends_the_recursion_proves() -> None:
+    """That of energies is of use: the other one would let the errors of single runs be many times as large."""
+    gains = design(find("zhu2020-lossy"))
+    known = single_run(gains)
+    assert known is not None
+    ends_it = least_of_P(gains.problem, prover_of(gains))
+    assert ends_it is not None
+    assert known[0] < 0.2 * ends_it[0]
+
+
 def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: Gains) -> None:
     P = prover_of(exact).P
     assert P is not None
     turned = exact.certificate.model_copy(update={"form": "full", "P": {"linked": -P[0]}})
-    assert single_run_gamma(exact.model_copy(update={"certificate": turned})) is None
+    assert single_run(exact.model_copy(update={"certificate": turned})) is None
     assert account_of(tmp_path).chance is None
