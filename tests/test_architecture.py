@@ -57,9 +57,10 @@ ROOMS = {
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model",
-    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
+    "designer.box": "designer.decay designer.gain designer.ladder designer.model designer.proof designer.search",
+    "designer.synthesis": "designer.box designer.diagnosis designer.gain designer.lmi designer.model designer.proof "
+    "designer.search",
     "designer.stacked": "designer.model",
-    "designer.box": "designer.decay designer.gain designer.model designer.proof",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.lmi designer.model designer.proof designer.search designer.stacked",
     "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "

@@ -11,19 +11,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable, counted
-from agent.contract.gains import Gains, LinkMatrices
+from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, truth_at
 from designer.box.robust import Robust, problem_at, robust, worst
 from designer.gain.exact import Operator, horizon_gain
 from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
+from designer.ladder import Ladder, percent
 from designer.model.error_model import link_gains, stacked_links
 from designer.model.units import NaturalUnits
 from designer.search import bfgs
@@ -53,26 +54,33 @@ class ForBox(NamedTuple):
         """Whether the gains are others than those of the nominal design; then gamma for the box is less."""
         return self.gains is not self.nominal
 
+    def on(self, ladder: Ladder) -> Ladder:
+        """The ladder of the gains with the rungs of the box, and those of the nominal design."""
+        found = self.robust.found if math.isfinite(self.robust.found) else None
+        ladder = ladder._replace(found_in_box=found, proved_in_box=self.robust.gamma)
+        if not self.better:
+            return ladder
+        exact = self.nominal.certificate.exact
+        return ladder._replace(nominal_exact=exact and exact[1], nominal_in_box=self.before.gamma)
+
     def document(self) -> dict[str, Any]:
         """For --json."""
-        return {
-            "within": self.robust.document(),
-            "nominal": {"gamma": self.nominal.gamma, "proved_in_box": self.before.gamma, "kept": not self.better},
-        }
+        nominal = {"gamma": self.nominal.gamma, "proved": self.before.gamma, "kept": not self.better}
+        return {**self.robust.document(), "nominal": nominal, "said": self.lines()}
 
-    def line(self) -> str:
-        """For people: what the search was worth."""
+    def lines(self) -> list[str]:
+        """For people, below the ladder."""
+        return [*self.robust.lines(), f"           {self._worth()}"]
+
+    def _worth(self) -> str:
+        after, before = self.robust.gamma, self.before.gamma
         if not self.better:
             return f"the nominal design is kept: {self.searched}"
-        after, before = self.robust.gamma, self.before.gamma
         assert after is not None
-        price = f"{100.0 * (self.gains.gamma / self.nominal.gamma - 1.0):.2f} % more without uncertainty"
+        price = f"{percent(self.gains.gamma / self.nominal.gamma - 1.0)} without uncertainty"
         if before is None:
-            return f"for the nominal design nothing is proved; these gains have {price}: {self.searched}"
-        return (
-            f"{100.0 * (1.0 - after / before):.2f} % less than is proved for the nominal design, and {price}: "
-            f"{self.searched}"
-        )
+            return f"for the nominal design no gamma is proved; against it {price}: {self.searched}"
+        return f"against the nominal design {percent(after / before - 1.0)} in the box, {price}: {self.searched}"
 
 
 def design_for_box(
@@ -80,43 +88,52 @@ def design_for_box(
     box: Box,
     nominal: Gains,
     *,
+    search: bool = True,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> ForBox:
     """Gains with a lower proved gamma for the box than the nominal design, or that.
 
-    KeyboardInterrupt ends the search, and so does the end of the budget; what was best is returned.
+    KeyboardInterrupt ends the search, and so does the end of the budget; what was best is returned. Gains of another
+    method than "exact" are taken as they are, and so are all where not to `search`.
     """
-    started, budget = time.perf_counter(), Budget() if budget is None else budget
+    started = time.perf_counter()
     try:
         before = robust(problem, nominal.K, nominal.H, box)
     except KeyboardInterrupt:  # without it nothing is known of the box
-        before, budget = robust(problem, nominal.K, nominal.H, box), Budget(0.0)
-    search = _Search(problem, box, nominal, before, budget, progress)
-    ended = search.run()
-    searched = f"{ended} after {counted(search.steps, 'change')} at {counted(len(search.met), 'corner')} of the box"
-    if search.best is None:
+        before, search = robust(problem, nominal.K, nominal.H, box), False
+    if nominal.method != "exact":
+        return ForBox(nominal, before, nominal, before, f"method {nominal.method} does not design for a box")
+    if not search:
+        return ForBox(nominal, before, nominal, before, "interrupted, nothing else was tried")
+    descent = _Search(problem, box, nominal, before, Budget() if budget is None else budget, progress)
+    ended = descent.run()
+    searched = f"{ended} after {counted(descent.steps, 'change')} at {counted(len(descent.met), 'corner')} of the box"
+    if descent.best is None:
         return ForBox(nominal, before, nominal, before, f"nothing better was found; {searched}")
-    K, H, after = search.best
+    K, H, after = descent.best
     try:
-        certificate = certify(problem, K, H)
+        certificate = _certified(problem, K, H)
     except Unattainable:
         return ForBox(nominal, before, nominal, before, f"what was found has no certificate; {searched}")
-    known = {name: getattr(nominal.certificate, name) for name in ("floor", "lmi_gamma", "lmi_exact")}
-    status = f"{nominal.solver.status}; for {box.extent}: {searched}"
+    known = {name: getattr(nominal.certificate, name) for name in ("floor", "lmi_gamma", "lmi_exact", "lmi_least")}
+    status, steps = f"{nominal.solver.status}; for {box.extent}: {searched}", nominal.solver.iterations + descent.steps
     spent = time.perf_counter() - started
-    gains = nominal.model_copy(
-        update={
-            "K": K,
-            "H": H,
-            "certificate": certificate.model_copy(update=known),
-            "solver": nominal.solver.model_copy(
-                update={"status": status, "iterations": nominal.solver.iterations + search.steps}
-            ),
-            "seconds": nominal.seconds | {"box": spent, "total": nominal.seconds["total"] + spent},
-        }
-    )
-    return ForBox(with_worst_case(gains), after, nominal, before, searched)
+    update = {
+        "K": K,
+        "H": H,
+        "certificate": certificate.model_copy(update=known),
+        "solver": nominal.solver.model_copy(update={"status": status, "iterations": steps}),
+        "seconds": nominal.seconds | {"box": spent, "total": nominal.seconds["total"] + spent},
+    }
+    return ForBox(with_worst_case(nominal.model_copy(update=update)), after, nominal, before, searched)
+
+
+def _certified(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
+    try:
+        return certify(problem, K, H)
+    except KeyboardInterrupt:  # the search is over
+        return certify(problem, K, H)
 
 
 class _Search:
@@ -154,30 +171,26 @@ class _Search:
 
     def _stopped(self, why: str) -> str:
         if not self.is_proved:
-            try:
+            with suppress(KeyboardInterrupt):  # what was proved before is there
                 self.prove()
-            except KeyboardInterrupt:
-                pass  # what was proved before is there
         return why
 
     def descend(self) -> None:
         """Down the weights, until gamma for the box falls no further."""
         self.budget.check()
-        self.meet(math.inf)
+        self.meet(math.inf, most=1)
         last = math.inf
         for mu in _WEIGHTS:
-            for _ in range(_ROUNDS):
-                y = self.follow(mu)
+            most = min(len(self.met) + _ROUNDS, _MOST_MODELS)
+            while self.meet(self.follow(mu), most=most):
                 self.budget.check()
-                if not self.meet(math.exp(y / 2.0)):
-                    break
             gamma = self.prove()
-            if not gamma < last * (1.0 - _BETTER):
+            if math.isfinite(last) and not gamma < last * (1.0 - _BETTER):
                 break
             last = gamma
 
     def follow(self, mu: float) -> float:
-        """The minimum of J for the models met so far; log g there."""
+        """To the minimum of J for the models met so far; sqrt(g) there, in natural units."""
         operators = [
             Operator(inputs.model(*self.barrier.entries.unpack(self.v)), inputs.pattern)
             for inputs in self.barrier.models
@@ -185,24 +198,26 @@ class _Search:
         g = max(horizon_gain(operator, self.barrier.horizon, width=1e-3)[1] for operator in operators)
         x = np.append(self.v, math.log(1.02 * g))
 
-        def advance(x: Array) -> None:
-            self.v, self.is_proved = x[:-1], False
+        def advance(point: bfgs.Point) -> None:
+            self.v, self.is_proved = point.x[:-1], False
             self.steps += 1
             if self.progress is not None:
                 start = f"the nominal design, with {counted(len(self.met), 'corner')} of the box"
-                gamma = self.natural.output * math.exp(x[-1] / 2.0)
+                gamma = self.natural.output * math.exp(point.x[-1] / 2.0)
                 self.progress(Progress(start, mu, self.steps, gamma, self.budget.spent, self.barrier.horizon))
 
         first = self.barrier.inverse_hessian(x, mu)
         function = self.budget.watched(self.barrier.descent(mu))
-        return float(bfgs.minimise(function, x, first, advance, enough=0.3 * mu).x[-1])
+        return math.exp(bfgs.minimise(function, x, first, advance, enough=0.3 * mu).x[-1] / 2.0)
 
-    def meet(self, gamma: float) -> bool:
-        """Whether there is more to do on this weight: a corner that is new, or a longer horizon."""
+    def meet(self, gamma: float, *, most: int) -> bool:
+        """Whether there is more to do on this weight: one corner more, up to so many, or a horizon twice as long."""
         problem, gains = self.natural.problem, self.barrier.entries.unpack(self.v)
         ends, rows, gain = worst(problem, *link_gains(problem, *gains), self.box)
         corner = tuple(ends), tuple(rows)
-        if corner not in self.met and len(self.met) < _MOST_MODELS:
+        if corner not in self.met:
+            if len(self.met) == most:
+                return False
             self.met.add(corner)
             truth = problem_at(problem, truth_at(problem, self.box, ends, rows))
             self.barrier.models.append(Inputs(truth, problem.beta))

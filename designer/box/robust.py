@@ -137,7 +137,7 @@ def _model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> 
 
 
 def problem_at(problem: Problem, truth: Truth) -> Problem:
-    """The problem whose file says the truth. A probability of 0, or of 1, is nearly that: a file has none of the former."""
+    """The problem whose file says the truth. Probabilities of 0 or 1 are nearly that: a file has none of the former."""
     document = problem.document()
     for j, node in enumerate(document["node"]):
         node["arrival_probability"] = truth.beta[j] if truth.beta[j] == problem.beta[j] else _inside(truth.beta[j])

@@ -168,7 +168,7 @@ class Barrier:
         """The same of `noise`, by v."""
         swept, V, value = self._noisy(self.operator(v))
         slopes = slope(self.model(v), self.operator(v), self.inputs, swept, V, entries=self._moments)
-        found = self._swept(np.append(v, y), 0.0, moments=True)
+        found = self._swept(self.inputs, np.append(v, y), 0.0, moments=True)
         if found is None:
             return Blocks([], None)
         both = zip(self._known(swept, slopes, 1.0 / value), self._known(*found, mu), strict=True)

@@ -48,7 +48,7 @@ def start(function: Function, x: Array, first: Map) -> Point:
     return Point(x, *function(x), first, 1.0, ())
 
 
-def minimise(function: Function, x: Array, first: Map, advance: Callable[[Array], None], *, enough: float) -> Point:
+def minimise(function: Function, x: Array, first: Map, advance: Callable[[Point], None], *, enough: float) -> Point:
     """Steps until the last few together gain less than `enough`; `advance` is told of each."""
     point = start(function, x, first)
     values = [point.value]
@@ -58,7 +58,7 @@ def minimise(function: Function, x: Array, first: Map, advance: Callable[[Array]
             break
         point = following
         values.append(point.value)
-        advance(point.x)
+        advance(point)
         if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < enough:
             break
     return point

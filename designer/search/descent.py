@@ -285,9 +285,9 @@ class _Search:
     ) -> bfgs.Point:
         """L-BFGS within the budget, its steps counted."""
 
-        def counted(x: Array) -> None:
+        def counted(point: bfgs.Point) -> None:
             self.steps += 1
-            advance(x)
+            advance(point.x)
 
         return bfgs.minimise(self.budget.watched(function), x, inverse_hessian, counted, enough=enough)
 
