@@ -63,7 +63,7 @@ ROOMS = {
     "designer.stacked": "designer.model",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.lmi designer.model designer.proof designer.search designer.stacked",
-    "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
+    "designer.ranking": "designer.analysis designer.box designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",

@@ -29,6 +29,7 @@ from designer.ladder import NOMINAL, NOMINAL_IN_BOX
 from designer.model.error_model import stacked_links
 from designer.model.mismatch import error_model_of
 from designer.problems import text_of
+from designer.ranking import Rank, table
 from designer.search.descent import Budget, Progress
 from designer.synthesis import design, design_in_box
 
@@ -140,6 +141,25 @@ def test_what_is_said_has_both_designs(pendulum: Pendulum) -> None:
     assert said["within"]["said"][-1].strip().startswith("against the nominal design -")
     printed = design_text(said)
     assert all(line in printed for line in (NOMINAL, NOMINAL_IN_BOX, *said["within"]["said"]))
+
+
+def test_gains_are_ranked_by_what_is_proved_for_the_box(
+    pendulum: Pendulum, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """There the nominal design comes after that for the box, though its own gamma is less."""
+    other = tmp_path / "nominal.json"
+    pendulum.nominal.save(other)
+    problem = str(pendulum.path.with_name("pendulum.toml"))
+    words = ["analyse", problem, "--gains", str(other), "--against", str(pendulum.path)]
+    assert main([*words, "--against", "least-variance", "--json"]) == 0
+    rows = {row["gains"]: row for row in json.loads(capsys.readouterr().out)["against"]}
+    assert next(iter(rows)) == str(pendulum.path)
+    ours, nominal = rows[str(pendulum.path)], rows[str(other)]
+    assert ours["in_box"] == pendulum.said["ladder"]["proved_in_box"] < nominal["in_box"]
+    assert nominal["gamma"] < min(ours["gamma"], rows["least-variance"]["gamma"])
+    printed = table([Rank(**row) for row in rows.values()], in_box=True).splitlines()
+    assert printed[0].split("  ")[0] == "proved for the box"
+    assert [line.split("  ")[-1].strip() for line in printed[1:]] == list(rows)
 
 
 # never worse
