@@ -20,6 +20,7 @@ from designer.lmi import beyond_paper
 FLOOR, EXACT, CERTIFIED = "floor", "exact gain of these gains", "gamma, certified"
 THEOREM1, LEAST = "what Theorem 1 certifies of these gains", "proved: no gains have less by"
 FOUND_IN_BOX, PROVED_IN_BOX = "exact gain of the worst model found in the box", "proved for every model in the box"
+NOMINAL, NOMINAL_IN_BOX = "exact gain of the nominal design", "the nominal design, proved for every model in the box"
 _NOTHING = 1e-6  # a floor this small beside the gain says nothing
 
 
@@ -36,6 +37,8 @@ class Ladder(NamedTuple):
     found_in_box: float | None = None  # what these gains have in the worst model of a box that was found
     proved_in_box: float | None = None  # gamma for every model of it
     theorem2_least: float | None = None  # proved: no gains have less by Theorem 2
+    nominal_exact: float | None = None  # of gains that were designed without the box, where these are others
+    nominal_in_box: float | None = None  # gamma of those for every model of the box
 
     @property
     def against_theorem2(self) -> float | None:
@@ -58,6 +61,7 @@ class Ladder(NamedTuple):
         """What every rung is called, and its value, the lowest first; without those that were not computed."""
         rungs = [
             (FLOOR, self.floor),
+            (NOMINAL, self.nominal_exact),
             (EXACT, self.exact and self.exact[1]),
             (CERTIFIED, self.gamma),
             (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
@@ -66,6 +70,7 @@ class Ladder(NamedTuple):
             (THEOREM1, self.theorem1),
             (FOUND_IN_BOX, self.found_in_box),
             (PROVED_IN_BOX, self.proved_in_box),
+            (NOMINAL_IN_BOX, self.nominal_in_box),
         ]
         there = [(name, value) for name, value in rungs if value is not None]
         return sorted(there, key=lambda rung: (rung[0] != FLOOR, rung[1]))

@@ -10,6 +10,8 @@ from typing import Any
 from agent.contract.errors import InputError, Unattainable, listed
 from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
+from designer.box.design import ForBox, design_for_box
+from designer.box.extent import Box
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
@@ -72,6 +74,27 @@ def design(
         raise explained(problem, error, _solvable) from None
     certificate = gains.certificate.model_copy(update={"floor": floor(problem), "lmi_least": _least_of_lmi(gains)})
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
+
+
+def design_in_box(
+    problem: Problem,
+    box: Box,
+    *,
+    method: str | None = None,
+    budget: float = BUDGET,
+    progress: Callable[[Progress], None] | None = None,
+    dask: str | None = None,
+    peak_slack: float = 0.0,
+) -> ForBox:
+    """Gains with a gamma that is proved for every model of the box, no larger than that of the nominal design.
+
+    As `design`, which begins and takes of the budget what it needs. Other methods do not design for a box, nor does
+    `peak_slack`: of their gains it is proved what holds.
+    """
+    seconds = Budget(budget)
+    nominal = design(problem, method=method, budget=budget, progress=progress, dask=dask, peak_slack=peak_slack)
+    stopped = nominal.solver.status.startswith("interrupted")
+    return design_for_box(problem, box, nominal, search=not stopped, budget=seconds, progress=progress)
 
 
 def _least_of_lmi(gains: Gains) -> float | None:

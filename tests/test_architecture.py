@@ -59,12 +59,13 @@ ROOMS = {
     "designer.single_run": "designer.gain designer.model designer.proof",
     "designer.start": "designer.gain designer.ladder designer.model designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
-    "designer.synthesis": "designer.diagnosis designer.gain designer.lmi designer.model designer.proof designer.search",
+    "designer.box": "designer.decay designer.gain designer.ladder designer.model designer.proof designer.search",
+    "designer.synthesis": "designer.box designer.diagnosis designer.gain designer.lmi designer.model designer.proof "
+    "designer.search",
     "designer.stacked": "designer.model",
-    "designer.box": "designer.decay designer.gain designer.model designer.proof",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.lmi designer.model designer.proof designer.search designer.stacked",
-    "designer.ranking": "designer.analysis designer.gain designer.ladder designer.model designer.search "
+    "designer.ranking": "designer.analysis designer.box designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",

@@ -93,7 +93,7 @@ class Robust(NamedTuple):
 
 def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robust:
     """The worst model that a search finds, and the least gamma for all: sought in floats, then proved."""
-    upper, rows, gain = _worst(problem, K, H, box)
+    upper, rows, gain = worst(problem, K, H, box)
     truth = truth_at(problem, box, upper, rows)
     values = [float((truth.beta if part.matrix == "beta" else truth.rho)[part.at]) for part in box.intervals]
     if not math.isfinite(gain):
@@ -132,7 +132,12 @@ def _differs(one: Truth, other: Truth) -> bool:
 
 
 def _model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
-    """Its error model in floats. A probability of 0, or of 1, is nearly that: a problem file has none of the former."""
+    """Its error model in floats."""
+    return error_model_of(problem_at(problem, truth), problem.beta, *stacked_links(problem, K, H))
+
+
+def problem_at(problem: Problem, truth: Truth) -> Problem:
+    """The problem whose file says the truth. Probabilities of 0 or 1 are nearly that: a file has none of the former."""
     document = problem.document()
     for j, node in enumerate(document["node"]):
         node["arrival_probability"] = truth.beta[j] if truth.beta[j] == problem.beta[j] else _inside(truth.beta[j])
@@ -140,14 +145,14 @@ def _model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> 
         at = problem.node_index(link["receiver"]), problem.node_index(link["sender"])
         link["delivery_probability"] = max(float(truth.rho[at]), _inside(0.0))
     document["markov"]["transition"] = [[float(pi) for pi in row] for row in truth.transition]
-    return error_model_of(Problem.from_document(document), problem.beta, *stacked_links(problem, K, H))
+    return Problem.from_document(document)
 
 
 def _inside(probability: float) -> float:
     return min(max(float(probability), float(np.finfo(float).tiny)), 1.0 - 2.0**-53)
 
 
-def _worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> tuple[list[bool], list[int], float]:
+def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> tuple[list[bool], list[int], float]:
     """A corner that no change of a single probability, or row, makes worse; and its exact gain."""
     choices = [2] * len(box.intervals) + [len(rows) for rows in box.rows]
     split = len(box.intervals)

@@ -35,7 +35,8 @@ def add_analyse(commands: Subcommands) -> None:
         action="append",
         default=[],
         metavar="FILE|METHOD",
-        help="rank them with other gains in one table, by gamma; a file, or a method of design; may be repeated",
+        help="rank them with other gains in one table, by gamma, or by that for the box if there is one; a file, or a "
+        "method of design; may be repeated",
     )
     add_within(analyse)
     analyse.add_argument(
@@ -67,9 +68,9 @@ def analyse_command(options: argparse.Namespace) -> int:
     if options.against:
         from designer.ranking import ranked, table
 
-        rows = ranked(problem, given, options.against)
+        rows = ranked(problem, given, options.against, box)
         facts["against"] = [row.document() for row in rows]
-        text += f"\n\n{table(rows)}"
+        text += f"\n\n{table(rows, in_box=box is not None)}"
     if options.table:
         print(analysis.ladder.table(problem.name, options.table), end="")
     else:

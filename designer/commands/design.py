@@ -6,7 +6,7 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,12 @@ from agent.contract.errors import EXIT_GOOD, InputError, counted
 from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM, add_set, add_table, find_to_design, refuse_both, tell_notes
 from designer.commands.stopping import stoppable
+from designer.commands.within import add_within, asked
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
+    from designer.ladder import Ladder
     from designer.search.descent import Progress
 
 METHODS = (
@@ -64,6 +66,7 @@ def add_design(commands: Subcommands) -> None:
         metavar="PART",
         help="gamma may be so much above the least one, 5%% or 0.05, for gains that let through the least noise",
     )
+    add_within(design, "design for every model in a box, and prove gamma for all of it")
     design.add_argument("--force", action="store_true", help="replace the gains file if it exists")
     add_table(design, "the ladder")
     design.add_argument("--json", action="store_true", help="print one JSON object")
@@ -98,14 +101,12 @@ def share(text: str) -> float:
 
 def design_command(options: argparse.Namespace) -> int:
     """`peakmesh design PROBLEM`."""
-    from designer.ladder import ladder_of
-
     refuse_both(options)
     problem = find_to_design(options.problem, options.settings)
     problem = _what_is_left(problem, options.without_node, options.without_link)
     if options.price:
         return _price_command(problem, options)
-    gains, result = design_and_save(
+    _, result = design_and_save(
         problem,
         options.method,
         options.output,
@@ -113,9 +114,10 @@ def design_command(options: argparse.Namespace) -> int:
         budget=options.budget,
         dask=options.dask,
         peak_slack=options.peak_slack,
+        within=options.within,
     )
     if options.table:
-        print(ladder_of(gains).table(problem.name, options.table), end="")
+        print(ladder_in(result).table(problem.name, options.table), end="")
     else:
         print(json.dumps(result) if options.json else design_text(result))
     return EXIT_GOOD
@@ -143,6 +145,7 @@ def design_and_save(
     budget: float | None = None,
     dask: str | None = None,
     peak_slack: float = 0.0,
+    within: Sequence[str] = (),
 ) -> tuple[Gains, dict[str, Any]]:
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
     path = output or Path(f"{problem.name}.gains.json")
@@ -152,8 +155,9 @@ def design_and_save(
     from designer.ladder import ladder_of
     from designer.proof.certificate import stored_P
     from designer.search.effort import BUDGET
-    from designer.synthesis import design  # only now: it loads a solver
+    from designer.synthesis import design, design_in_box  # only now: it loads a solver
 
+    box = asked(problem, within)
     warned = warnings(problem)
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
@@ -162,16 +166,17 @@ def design_and_save(
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
     with stoppable():
-        gains = design(
-            problem, method=method, budget=budget, progress=_descent_progress(), dask=dask, peak_slack=peak_slack
-        )
+        how: dict[str, Any] = {"method": method, "budget": budget, "dask": dask, "peak_slack": peak_slack}
+        how["progress"] = _descent_progress()
+        found = None if box is None else design_in_box(problem, box, **how)
+        gains = design(problem, **how) if found is None else found.gains
     if gains.solver.status.startswith("out of time"):
         print(
             f"warning: the search was out of time after {gains.solver.iterations} steps; --budget gives it more",
             file=sys.stderr,
         )
     gains.save(path, force=force)
-    proved = gains.certificate
+    proved, ladder = gains.certificate, ladder_of(gains)
     return gains, {
         "problem": problem.name,
         "method": gains.method,
@@ -180,7 +185,8 @@ def design_and_save(
         "lmi_gamma": proved.lmi_gamma,
         "exact": proved.exact,
         "floor": proved.floor,
-        "ladder": ladder_of(gains).document(),
+        "ladder": (ladder if found is None else found.on(ladder)).document(),
+        "within": None if found is None else found.document(),
         **beyond_gamma(problem, gains.K, gains.H, stored_P(gains)).document(),
         "holds": proved.holds,
         "solver": gains.solver.document(),
@@ -222,18 +228,26 @@ def _chosen_method(problem: Problem, budget: float | None) -> str:
     return method
 
 
+def ladder_in(result: dict[str, Any]) -> Ladder:
+    """The ladder among the facts of a design."""
+    from designer.ladder import Ladder
+
+    return Ladder(**{name: result["ladder"][name] for name in Ladder._fields})
+
+
 def design_text(result: dict[str, Any]) -> str:
     """The facts of a design, for people."""
     from designer.beyond_gamma import told
-    from designer.ladder import Ladder, rounded_up
+    from designer.ladder import rounded_up
 
     solver = result["solver"]
-    rungs = {name: result["ladder"][name] for name in Ladder._fields}
-    ladder = "\n           ".join(Ladder(**rungs).lines())
+    ladder = "\n           ".join(ladder_in(result).lines())
+    box = "".join(f"{line}\n" for line in (result["within"] or {"said": []})["said"])
     beyond = "\n".join(told(result))
     return (
         f"{result['problem']} by {result['method']}: gamma = {rounded_up(result['gamma'])}, certified\n"
         f"ladder     {ladder}\n"
+        f"{box}"
         f"{beyond}\n"
         f"solver     {solver['name']} {solver['version']}: {solver['iterations']} iterations, "
         f"{result['seconds']['total']:.1f} s in all\n"
@@ -271,6 +285,8 @@ def _price_command(problem: Problem, options: argparse.Namespace) -> int:
         raise InputError("--table prints the ladder of one design; --price has a table of its own, and --json")
     if options.peak_slack:
         raise InputError("--peak-slack is for one design; --price compares the least peaks")
+    if options.within:
+        raise InputError("--within is for one design; --price compares designs for the problem as it is")
     if options.budget is not None:
         raise InputError("--budget is for one design; --price goes to the end of each search, that all compare")
     if options.output is not None:

@@ -19,6 +19,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator, horizon_gain, recursion_holds, step
 from designer.gain.products import Collected, Pattern
 from designer.model.error_model import ErrorModel, Indices, LinkTerms, error_model, stacks
+from designer.model.mismatch import error_model_of
 
 
 class Sweep(NamedTuple):
@@ -55,12 +56,19 @@ class Slope(NamedTuple):
 
 
 class Inputs:
-    """What the gains multiply in (6)-(11), so that a derivative by the error model becomes one by the gains."""
+    """What the gains multiply in (6)-(11), so that a derivative by the error model becomes one by the gains.
 
-    def __init__(self, problem: Problem) -> None:
+    `told` (n,): the arrival probabilities that the filters use, where those of the problem are others.
+    """
+
+    def __init__(self, problem: Problem, told: Array | None = None) -> None:
         bar, nx = stacks(problem), problem.nx
         self.problem, self.bar, self.rho = problem, bar, problem.delivery
-        self.p = problem.plant_states
+        self.told, self.p = problem.beta if told is None else told, problem.plant_states
+        off = np.where([node.seen for node in problem.nodes], 0.0, problem.beta - self.told)
+        of_row = np.repeat(off, [len(node.C) for node in problem.nodes])[:, None]
+        self.C_e = bar.C_beta - of_row * bar.C  # c_j C_j of every node, or beta_j C_j where it sees its losses
+        self.C_x = of_row * np.vstack([node.C for node in problem.nodes])[:, : self.p] if off.any() else None
         self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
         widths = [len(node.C) for node in problem.nodes]
         self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)
@@ -74,12 +82,17 @@ class Inputs:
         K = np.repeat(np.repeat(hears, nx, axis=1), nx, axis=2)
         H = np.repeat(np.repeat(hears, nx, axis=1), widths, axis=2)
         some = (np.where(at, numbers.uniform(1.0, 2.0, at.shape), 0.0) for at in (K, H))
-        return Pattern(error_model(self.problem, *some))
+        return Pattern(self.model(*some))
+
+    def model(self, K_bar: Array, H_bar: Array) -> ErrorModel:
+        """The error model of these gains."""
+        return error_model_of(self.problem, self.told, K_bar, H_bar)
 
     def gains(self, model: ErrorModel, AB: Array, lossy: Array, V: Array | None) -> tuple[Array, Array]:
         """Derivatives by K_bar and H_bar, from those by the rows of e in [A B], by H of `lossy` and by V of the links.
 
-        K_ij stands in columns x, e_j (times rho_ij) and e_i (times 1 - rho_ij); H_ij in those of e_j and w.
+        K_ij stands in columns x, e_j (times rho_ij) and e_i (times 1 - rho_ij); H_ij in those of e_j and w, and in
+        those of x where the filters are told something else.
         """
         p, n, nx, bar = self.p, self.problem.n, self.problem.nx, self.bar
         modes, x, e, w = len(AB), AB[:, :, :p], AB[:, :, p : p + n * nx], AB[:, :, p + n * nx :]
@@ -88,7 +101,9 @@ class Inputs:
         K = self.rho_K * e + (1.0 - self.rho_K) * every
         if not self.problem.unbiased:
             K -= np.tile(x, (1, 1, n))
-        H = lossy - e @ bar.C_beta.T - w @ bar.D_beta.T
+        H = lossy - e @ self.C_e.T - w @ bar.D_beta.T
+        if self.C_x is not None:
+            H -= x @ self.C_x.T
         H *= self.rho_H
         if V is not None and model.links is not None:
             self._add_links(model.links, model.R, V, K, H)
@@ -103,8 +118,10 @@ class Inputs:
                 continue
             e_i, e_j, w = V[term, :, p : p + nx], V[term, :, p + nx : p + 2 * nx], V[term, :, p + 2 * nx :]
             K[s, rows, j * nx : (j + 1) * nx] += e_j - e_i
-            C_j = bar.C_beta[columns, j * nx : (j + 1) * nx]
+            C_j = self.C_e[columns, j * nx : (j + 1) * nx]
             H[s, rows, columns] -= e_j @ C_j.T + w @ bar.D_beta[columns].T
+            if self.C_x is not None:
+                H[s, rows, columns] -= V[term, :, :p] @ self.C_x[columns].T
 
 
 def slope(

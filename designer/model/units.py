@@ -84,6 +84,12 @@ class NaturalUnits:
         ]
         self.names, self.problem = problem.node_names, scaled.model_copy(update={"nodes": tuple(nodes)})
 
+    def there(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
+        """Gains of the problem that was given, in the units of `problem`."""
+        rows, y = 1.0 / self.state[:, None], {name: 1.0 / y for name, y in zip(self.names, self.y, strict=True)}
+        x = dict.fromkeys(self.names, 1.0 / self.state)
+        return _divided(K, rows, x), _divided(H, rows, y)
+
     def back(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
         """Gains of `problem`, in the units of the problem that was given."""
         rows, y = self.state[:, None], dict(zip(self.names, self.y, strict=True))

@@ -7,12 +7,14 @@ With y = log g,
 is finite exactly where gamma_T^2 < g, and costs one sweep and one covariance: gamma_T itself is never searched for.
 B'Y_bar B is the block of w in `Operator.joint`. The last term, with X_0 the identity in natural units and kappa small,
 is what an error at the start of the horizon still weighs at its end: without it, what grows slowly costs nothing
-within T. docs/theory.md, section 6.
+within T. docs/theory.md, section 6. Of several models, J has the sum of theirs, and is finite where each of their
+gamma_T^2 is below g.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +24,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.gain.noise import long_run
 from designer.gain.sensitivity import Inputs, Slope, Sweep, slope, sweep
-from designer.model.error_model import ErrorModel, Indices, error_model
+from designer.model.error_model import ErrorModel, Indices
 from designer.model.units import natural_units
 from designer.search import bfgs
 from designer.search.entries import Entries
@@ -64,20 +66,22 @@ class Blocks:
 
 
 class Barrier:
-    """J and what it is made of, for one problem; x = [v; y] holds the gains' entries and y = log g."""
+    """J and what it is made of, for one problem; x = [v; y] holds the gains' entries and y = log g.
 
-    def __init__(self, problem: Problem, horizon: int) -> None:
+    `models`: what the same gains may meet beside the problem itself.
+    """
+
+    def __init__(self, problem: Problem, horizon: int, models: Sequence[Inputs] = ()) -> None:
         self.problem, self.horizon = problem, horizon
         self.entries, self.inputs = Entries(problem), Inputs(problem)
-        units = np.tile(natural_units(problem).state, problem.n + (1 if problem.plant_states else 0))
-        self.size = len(units)
-        self._X = np.broadcast_to(np.diag(units**2), (len(problem.topologies), len(units), len(units)))
+        self.models = [self.inputs, *models]
+        self.size, self._units = problem.plant_states + problem.n * problem.nx, natural_units(problem).state
         self._nodes, self._moments = self._heard()
         self._initial = problem.mode_index(problem.markov.initial)
 
     def model(self, v: Array) -> ErrorModel:
         """The error model of the gains v."""
-        return error_model(self.problem, *self.entries.unpack(v))
+        return self.inputs.model(*self.entries.unpack(v))
 
     def operator(self, v: Array) -> Operator:
         """The same, in the shapes of the recursions."""
@@ -151,7 +155,7 @@ class Barrier:
         by y the sum of mu tr(W^-2 - W^-1), W = I - B'Y_bar B / g. Other units of x and y scale it as they scale v, so
         the steps do not depend on them. Without an entry for y, for x = v, where ridge is not 0.
         """
-        found = self._swept(x, 0.0, moments=True)
+        found = self._swept(self.inputs, x, 0.0, moments=True)
         if found is None:
             return Blocks([], None)
         swept, slopes = found
@@ -164,7 +168,7 @@ class Barrier:
         """The same of `noise`, by v."""
         swept, V, value = self._noisy(self.operator(v))
         slopes = slope(self.model(v), self.operator(v), self.inputs, swept, V, entries=self._moments)
-        found = self._swept(np.append(v, y), 0.0, moments=True)
+        found = self._swept(self.inputs, np.append(v, y), 0.0, moments=True)
         if found is None:
             return Blocks([], None)
         both = zip(self._known(swept, slopes, 1.0 / value), self._known(*found, mu), strict=True)
@@ -195,28 +199,37 @@ class Barrier:
 
     def _inside(self, x: Array, kappa: float) -> tuple[float, Array]:
         """-sum of log det (I - B'Y_bar B / g) + kappa tr(X_0 Y_T) / g by [v; y]; infinite where gamma_T^2 >= g."""
-        found = self._swept(x, kappa)
-        if found is None:
-            return math.inf, np.zeros_like(x)
-        swept, slopes = found
-        g, count = math.exp(x[-1]), math.prod(swept.W_inverse.shape[:3])
-        traces = float(np.trace(swept.W_inverse, axis1=2, axis2=3).sum())
-        late = kappa / g * float(np.vdot(self._X, swept.Y))
-        by_gains = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
-        return late - swept.log_det, np.append(by_gains, count - g * (traces - slopes.g) - late)
+        value, gradient = 0.0, np.zeros_like(x)
+        for inputs in self.models:
+            found = self._swept(inputs, x, kappa)
+            if found is None:
+                return math.inf, np.zeros_like(x)
+            swept, slopes = found
+            g, count = math.exp(x[-1]), math.prod(swept.W_inverse.shape[:3])
+            traces = float(np.trace(swept.W_inverse, axis1=2, axis2=3).sum())
+            late = kappa / g * float(np.vdot(self._X(inputs), swept.Y))
+            by_gains = self.entries.pack_slope(slopes.K_bar, slopes.H_bar)
+            value += late - swept.log_det
+            gradient += np.append(by_gains, count - g * (traces - slopes.g) - late)
+        return value, gradient
 
-    def _swept(self, x: Array, kappa: float, *, moments: bool = False) -> tuple[Sweep, Slope] | None:
-        """The sweep at [v; y] and the slopes of `_inside`; None where gamma_T^2 >= g."""
+    def _swept(self, inputs: Inputs, x: Array, kappa: float, *, moments: bool = False) -> tuple[Sweep, Slope] | None:
+        """The sweep of one model at [v; y] and the slopes of `_inside`; None where gamma_T^2 >= g."""
         v, y = x[:-1], float(x[-1])
         if abs(y) > 300.0 or np.abs(v).max() > 1e50:  # squares overflow
             return None
-        model = self.model(v)
-        operator = Operator(model, self.inputs.pattern)
+        model = inputs.model(*self.entries.unpack(v))
+        operator = Operator(model, inputs.pattern)
         swept = sweep(operator, math.exp(y), self.horizon)
         if swept is None:
             return None
-        X, entries = kappa * math.exp(-y) * self._X, self._moments if moments else None
-        return swept, slope(model, operator, self.inputs, swept, swept.W_inverse, X=X, entries=entries)
+        X, entries = kappa * math.exp(-y) * self._X(inputs), self._moments if moments else None
+        return swept, slope(model, operator, inputs, swept, swept.W_inverse, X=X, entries=entries)
+
+    def _X(self, inputs: Inputs) -> Array:
+        """X_0, (modes, n_eta, n_eta)."""
+        units = np.tile(self._units, self.problem.n + (1 if inputs.p else 0))
+        return np.broadcast_to(np.diag(units**2), (len(self.problem.topologies), len(units), len(units)))
 
     def _heard(self) -> tuple[dict[tuple[int, int], _Node], Indices]:
         """By (s, i), and which moments of [eta; w] they ask for together."""

@@ -19,6 +19,8 @@ Function = Callable[[Array], tuple[float, Array]]  # value and gradient
 Map = Callable[[Array], Array]  # a symmetric positive matrix times a vector
 
 _PAIRS = 100
+_PATIENCE = 10
+_MOST_STEPS = 300
 
 
 class Pair(NamedTuple):
@@ -44,6 +46,22 @@ class Point(NamedTuple):
 def start(function: Function, x: Array, first: Map) -> Point:
     """The first point."""
     return Point(x, *function(x), first, 1.0, ())
+
+
+def minimise(function: Function, x: Array, first: Map, advance: Callable[[Point], None], *, enough: float) -> Point:
+    """Steps until the last few together gain less than `enough`; `advance` is told of each."""
+    point = start(function, x, first)
+    values = [point.value]
+    while len(values) < _MOST_STEPS:
+        following = step(function, point)
+        if following is None:
+            break
+        point = following
+        values.append(point.value)
+        advance(point)
+        if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < enough:
+            break
+    return point
 
 
 def step(function: Function, point: Point) -> Point | None:

@@ -40,8 +40,6 @@ _SHORT_OF_MU = 0.3
 _COARSE = 1e-3  # of gamma^2, where starts are compared
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
-_PATIENCE = 10
-_MOST_STEPS = 300  # for each mu
 _NOTHING = 1e-200  # gamma^2 below this is 0
 _VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
@@ -119,6 +117,15 @@ class Budget:
         """TimeIsUp where it is."""
         if self.spent >= self.seconds:
             raise TimeIsUp
+
+    def watched(self, function: bfgs.Function) -> bfgs.Function:
+        """The same, but TimeIsUp when it is."""
+
+        def watched(x: Array) -> tuple[float, Array]:
+            self.check()
+            return function(x)
+
+        return watched
 
 
 class TimeIsUp(Exception):
@@ -276,25 +283,13 @@ class _Search:
         *,
         enough: float,
     ) -> bfgs.Point:
-        """L-BFGS until the last few steps together gain less than `enough`."""
+        """L-BFGS within the budget, its steps counted."""
 
-        def watched(x: Array) -> tuple[float, Array]:
-            self.budget.check()
-            return function(x)
-
-        point = bfgs.start(watched, x, inverse_hessian)
-        values = [point.value]
-        while len(values) < _MOST_STEPS:
-            following = bfgs.step(watched, point)
-            if following is None:
-                break
-            point = following
-            values.append(point.value)
+        def counted(point: bfgs.Point) -> None:
             self.steps += 1
             advance(point.x)
-            if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < enough:
-                break
-        return point
+
+        return bfgs.minimise(self.budget.watched(function), x, inverse_hessian, counted, enough=enough)
 
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:

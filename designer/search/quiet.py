@@ -32,8 +32,6 @@ _WEIGHTS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # mu
 _HORIZON = 20
 _UNSEEN = 1e-3  # so much of the noise may come from before the horizon
 _INSIDE = 1e-7  # by this part the search keeps away from the gamma that is allowed, for the proof
-_PATIENCE = 10
-_MOST_STEPS = 300  # for each mu
 
 
 class Quiet(NamedTuple):
@@ -136,24 +134,12 @@ class _Search:
         return v
 
     def _minimised(self, v: Array, mu: float) -> Array:
-        noise = self.barrier.noise(self.y, mu)
-
-        def watched(v: Array) -> tuple[float, Array]:
-            self.budget.check()
-            return noise(v)
-
-        point = bfgs.start(watched, v, self.barrier.inverse_hessian_of_noise(v, self.y, mu))
-        values = [point.value]
-        while len(values) < _MOST_STEPS:
-            following = bfgs.step(watched, point)
-            if following is None:
-                break
-            point, self.steps = following, self.steps + 1
-            values.append(point.value)
+        def advance(point: bfgs.Point) -> None:
+            self.steps += 1
             self._tell(mu, point.value)
-            if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < 0.1 * mu:
-                break
-        return point.x
+
+        noise, first = self.barrier.noise(self.y, mu), self.barrier.inverse_hessian_of_noise(v, self.y, mu)
+        return bfgs.minimise(self.budget.watched(noise), v, first, advance, enough=0.1 * mu).x
 
     def _tell(self, mu: float, value: float) -> None:
         if self.progress is not None:

@@ -100,7 +100,8 @@ def step(gains: Gains, truth: Truth, Y: Array, g: float) -> Array | None:
 
 def peak(problem: Problem) -> Array:
     """M'M of every mode."""
-    M = np.hstack([np.zeros((problem.n * problem.nz, problem.nx)), np.kron(np.eye(problem.n), problem.plant.M)])
+    weighted = np.kron(np.diag(problem.weights), problem.plant.M)
+    M = np.hstack([np.zeros((problem.n * problem.nz, problem.nx)), weighted])
     return np.tile(M.T @ M, (len(problem.topologies), 1, 1))
 
 

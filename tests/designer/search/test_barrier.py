@@ -11,7 +11,7 @@ from networks import random_gains, random_problem, real_networks
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
-from designer.gain.sensitivity import slope, sweep
+from designer.gain.sensitivity import Inputs, slope, sweep
 from designer.model.error_model import error_model
 from designer.model.units import natural_units
 from designer.search.barrier import Barrier
@@ -36,6 +36,35 @@ def test_the_gradients_of_all_barriers_agree_with_differences(problem: Problem) 
             direction = 1e-5 * rng.normal(size=len(x))
             difference = function(x + direction)[0] - function(x - direction)[0]
             assert difference / 2.0 == pytest.approx(float(gradient @ direction), rel=1e-5, abs=1e-10)
+
+
+def others(problem: Problem, seed: int) -> Inputs:
+    """The same network with other probabilities, which its filters are not told."""
+    rng, document = np.random.default_rng(seed), problem.document()
+    for node in document["node"]:
+        node["arrival_probability"] = float(rng.uniform(0.3, 0.9))
+    for link in document.get("link", []):
+        link["delivery_probability"] = float(rng.uniform(0.3, 0.9))
+    document["markov"]["transition"] = rng.dirichlet(np.ones(len(problem.topologies)), len(problem.topologies)).tolist()
+    return Inputs(Problem.from_document(document), problem.beta)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
+def test_the_gradient_of_several_models_agrees_with_differences(problem: Problem) -> None:
+    """Whose losses, deliveries and switching are others than the filters were told."""
+    barrier = Barrier(problem, 9, [others(problem, seed) for seed in (0, 1)])
+    v = barrier.entries.pack(
+        *(least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1))
+    )
+    J, y = barrier.descent(0.03), 0.0
+    while not math.isfinite(J(np.append(v, y))[0]):
+        y += 1.0
+    x, rng = np.append(v, y + 0.5), np.random.default_rng(0)
+    assert J(x)[0] != pytest.approx(Barrier(problem, 9).descent(0.03)(x)[0], rel=1e-6)
+    for _ in range(4):
+        direction = 1e-5 * rng.normal(size=len(x))
+        difference = J(x + direction)[0] - J(x - direction)[0]
+        assert difference / 2.0 == pytest.approx(float(J(x)[1] @ direction), rel=1e-5, abs=1e-10)
 
 
 def test_the_barrier_is_finite_exactly_where_g_is_above_gamma_squared() -> None:
