@@ -14,6 +14,11 @@ BLOCK = 8  # steps that are given in order, and then as many of which all messag
 LATER = b',"since_a_later_version":[1.5,{"kind":"any"}]'  # a field that no version has
 
 
+def later(setting: Setting) -> str:
+    """The same with messages of a later version."""
+    return whole(setting, also=LATER)
+
+
 def whole(setting: Setting, *, also: bytes = b"") -> str:
     """A run from its beginning to its end; returns what was compared."""
     with Trial(setting, also=also) as trial:

@@ -38,10 +38,15 @@ class Setting:
 class Trial:
     """A run; use it with `with`. Whatever the program does wrong is raised as a Difference."""
 
-    def __init__(self, setting: Setting, *, period: float = 0.0, also: bytes = b"") -> None:
+    def __init__(self, setting: Setting, *, period: float = 0.0, first: int = 0, also: bytes = b"") -> None:
+        """`first` is the number of the program's first message."""
         self.setting, self.play, self.node = setting, setting.play, setting.node
         self.who, self.own = node_who(setting.node), setting.play.gains.for_node(setting.node)
-        self.period, self._also = period, also  # `also` stands in every message, as a later version might have it
+        self.period, self._first, self._also = (
+            period,
+            first,
+            also,
+        )  # `also` stands in every message, as a later version might have it
         self.stage = Stage("conform", setting.node)
         self.session = ""
         self.code: int | None = None
@@ -95,7 +100,7 @@ class Trial:
                 if self.session:
                     raise Difference(f'it shows a second token, "{session}"', field="session")
                 self.session = session
-                self.judge = Judge(self.own, session=session, tolerance=self.setting.tolerance)
+                self.judge = Judge(self.own, session=session, first=self._first, tolerance=self.setting.tolerance)
             case Gone() if not self._may_end:
                 while not isinstance(end := self.stage.next(self.setting.deadline), Ended):
                     if end is None:
@@ -134,8 +139,8 @@ class Trial:
         return f"; it said: {said}" if said else ""
 
     # What happens.
-    def meet(self, *, first: Callable[[], None] = lambda: None) -> None:
-        """Until the program is ready; the recorder comes last, `first` is done before."""
+    def meet(self) -> None:
+        """Until everybody is there, the recorder last."""
         stage, setting = self.stage, self.setting
         others = [who for who in participants(self.play.gains.problem) if who not in (self.who, RECORDER)]
         names = [name for name in self.play.gains.problem.node_names if name != self.node]
@@ -151,8 +156,14 @@ class Trial:
             raise Difference(str(error), None, "version", self.joined.version, version("peakmesh")) from None
         if self.ready:
             raise Difference("it was ready before the recorder was there: it must wait for the tokens of all")
-        first()
         stage.appear(RECORDER)
+
+    def meet_underway(self, step: int) -> None:
+        """The run goes on, and `step` is the next: the recorder greets the program with the number that it has come to."""
+        self.meet()
+        self.order("start", step=step)
+        self.until(lambda: any(word.asks for word in self.ready), "its question to the recorder, ready with asks")
+        self.acknowledge(self._first, greets=self.who)
 
     def be_ready(self) -> None:
         """Its word, with the digest of the gains."""
@@ -208,12 +219,12 @@ class Trial:
 
         Then it ends by itself.
         """
-        first = len(self.sent) - min(len(self.sent), KEPT)
+        first, total = self._first + max(0, len(self.sent) - KEPT), self._first + len(self.sent)
         self.acknowledge(first)
         self.order(order, **facts)
         self.ask_again(first)
         self._may_end = True
-        self.acknowledge(len(self.sent), closed=True)
+        self.acknowledge(total, closed=True)
         self.until(lambda: self.code is not None, "its end", seconds=self.setting.wait)
         if order == "close" and self.code:
             raise Difference(f"it ended {_in_words(self.code)} after a good run, must be 0{self._last_words()}")
@@ -225,8 +236,8 @@ class Trial:
         self.answers, self._asked = [], True
         self.stage.ask(first)
         self.until(lambda: not self._asked, "an answer to the recorder's question", seconds=self.setting.wait)
-        for number, sent in enumerate(self.sent[first:], first):
-            answer = self.answers[number - first] if number - first < len(self.answers) else None
+        for place, sent in enumerate(self.sent[first - self._first :]):
+            answer, number = self.answers[place] if place < len(self.answers) else None, first + place
             if answer is None or answer[:3] != sent[:3]:
                 came = "nothing" if answer is None else "another message"
                 raise Difference(
