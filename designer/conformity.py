@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from agent.contract.gains import Certificate, Gains, Solver
@@ -15,36 +16,23 @@ from designer.model.error_model import link_gains
 from designer.problems import find
 from designer.search.starts import consensus_gains
 
+Change = Callable[[dict[str, Any]], object]
+
 
 @dataclass(frozen=True)
 class Network:
-    """What is tried in it, and which node of it the program is."""
+    """A built-in problem, changed, and the node of it that a program is."""
 
-    name: str
     what: str
-    gains: Gains
+    problem: str
     node: str
+    change: Change = lambda document: None
 
-
-def networks() -> list[Network]:
-    """From what the paper has to what real networks have."""
-    return [
-        _network("ideal", "the ideal example", "zhu2020-ideal", "3"),
-        _network("lossy", "the lossy example", "zhu2020-lossy", "3"),
-        _network("seen", "losses that are seen", "zhu2020-lossy", "3", _see_losses),
-        _network("links", "lossy links", "zhu2020-lossy", "3", _lose_messages),
-        _network("unbiased", "unbiased gains", "zhu2020-lossy", "3", lambda document: document.update(unbiased=True)),
-        _network("sizes", "different numbers of measurements", "quadruple-tank", "flows-left", _weigh),
-        _network("all", "all of that", "inverted-pendulum", "camera", _weigh),
-    ]
-
-
-def _network(
-    name: str, what: str, problem: str, node: str, change: Callable[[dict[str, Any]], object] = lambda document: None
-) -> Network:
-    document = find(problem).document()
-    change(document)
-    return Network(name, what, _consensus(Problem.from_document(document)), node)
+    @cached_property
+    def gains(self) -> Gains:
+        document = find(self.problem).document()
+        self.change(document)
+        return _consensus(Problem.from_document(document))
 
 
 def _see_losses(document: dict[str, Any]) -> None:
@@ -89,3 +77,14 @@ def _consensus(problem: Problem) -> Gains:
         solver=solver,
         seconds={"total": 0.0},
     )
+
+
+NETWORKS = {  # from what the paper has to what real networks have; the last has all of it
+    "ideal": Network("the ideal example", "zhu2020-ideal", "3"),
+    "lossy": Network("the lossy example", "zhu2020-lossy", "3"),
+    "seen": Network("losses that are seen", "zhu2020-lossy", "3", _see_losses),
+    "links": Network("lossy links", "zhu2020-lossy", "3", _lose_messages),
+    "unbiased": Network("unbiased gains", "zhu2020-lossy", "3", lambda document: document.update(unbiased=True)),
+    "sizes": Network("different numbers of measurements", "quadruple-tank", "flows-left", _weigh),
+    "all": Network("all of that", "inverted-pendulum", "camera", _weigh),
+}

@@ -93,12 +93,12 @@ class Judge:
                 raise _differs(k, f"{field}[{place}]", value, right, _hint(off, largest))
 
     # What is right, from what the node has told before: so a difference is of its own step, and none follows from it.
-    def first(self, y: Iterable[float]) -> Estimate:
+    def first(self, y: Iterable[float] | None) -> Estimate:
         """Of step 0."""
         return self._told(0, np.zeros(self._own.M.shape[1]), y, "", [])
 
     def following(self, before: Estimate, mode: str, heard: dict[str, Estimate], y: Iterable[float] | None) -> Estimate:
-        """After what it has told itself in the step before; `heard` are the others, `y` is None without a measurement."""
+        """After what it has told of the step before; `heard` are the others, `y` is None without a measurement."""
         pairs = {self._own.node: before} | heard
         there = {link.sender for link in self._own.links[mode]} & pairs.keys()
         found = {

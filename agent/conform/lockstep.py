@@ -5,18 +5,20 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import version
 
 from agent.conform.judge import Difference
 from agent.conform.trial import Setting, Trial
 from agent.contract.messages import Estimate
 
 BLOCK = 8  # steps that are given in order, and then as many of which all messages come before any is answered
-LATER = b',"since_a_later_version":[1.5,{"kind":"any"}]'  # a field that no version has
+LATER = "999999999"  # the last number of a version of this series that is later than any
 
 
 def later(setting: Setting) -> str:
-    """The same with messages of a later version."""
-    return whole(setting, also=LATER)
+    """The same with messages of a later version, which have a field that no version has."""
+    number = ".".join([*version("peakmesh").split(".")[:2], LATER])
+    return whole(setting, also=f',"new":[1.5,{{"kind":"any"}}],"version":"{number}"'.encode())
 
 
 def whole(setting: Setting, *, also: bytes = b"") -> str:

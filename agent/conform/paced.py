@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from agent.conform.judge import Difference
 from agent.conform.trial import Setting, Trial
-from agent.contract.keys import estimate, measurement, participants
+from agent.contract.keys import estimate, measurement
 from agent.contract.messages import ZERO_STATE, Account, Estimate, Event
 
 PERIOD = 0.5  # seconds: a lost measurement is waited for 0.2 s

@@ -38,7 +38,7 @@ class Play:
         plant = SimulatedPlant(problem, seed=self.seed, worst_case=self.gains.worst_case)
         owns = {name: self.gains.for_node(name) for name in problem.node_names}
         x_hat = {name: np.zeros(problem.nx) for name in owns}
-        mode, heard = "", dict.fromkeys(owns, list[str]())
+        mode, heard = "", {name: list[str]() for name in owns}
         for k in range(self.steps):
             _, measured = plant.advance(k)
             pairs = {

@@ -1,4 +1,4 @@
-"""The program that is judged: how it is started, told what to be, and ended."""
+"""The program that is judged: how it is started and ended."""
 
 from __future__ import annotations
 
@@ -7,47 +7,40 @@ import signal
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
 from agent.contract.errors import InputError
+from agent.guests import Program
 
 LAST_LINES = 3  # of what it has said, that are told
 
 
-class Program:
-    """A command in a session of its own. `told` is put into its words where they have {name}, and into PEAKMESH_NAME.
+class Running:
+    """A program in a session of its own. `ended` is called with its exit code, on a thread."""
 
-    `ended` is called with its exit code, on a thread.
-    """
-
-    def __init__(self, command: Sequence[str], told: Mapping[str, str], *, ended: Callable[[int], None]) -> None:
-        words = [*command]
-        for name, value in told.items():
-            words = [word.replace(f"{{{name}}}", value) for word in words]
-        variables = {f"PEAKMESH_{_VARIABLES.get(name, name).upper()}": value for name, value in told.items()}
+    def __init__(self, program: Program, *, ended: Callable[[int], None]) -> None:
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed in close
         try:
             self._process = subprocess.Popen(
-                words,
+                program.words,
                 stdin=subprocess.DEVNULL,
                 stdout=self._said,
                 stderr=self._said,
                 start_new_session=True,
-                env=os.environ | variables,
+                env=os.environ | program.environment,
             )
         except OSError as error:
             self._said.close()
-            raise InputError(f'the node, "{words[0]}", cannot be started: {error.strerror}') from None
+            raise InputError(f"the program, {program.words[0]}, cannot be started: {error.strerror}") from None
         self._watch = threading.Thread(target=lambda: ended(self._process.wait()), daemon=True)
         self._watch.start()
 
     def interrupt(self) -> None:
         """As somebody who wants it to end."""
-        with suppress(ProcessLookupError):
-            self._process.send_signal(signal.SIGTERM)
+        self._process.send_signal(signal.SIGTERM)
 
     def last_words(self) -> str:
         """What it has said last, on stdout and stderr; "" where it has said nothing."""
@@ -59,7 +52,6 @@ class Program:
         """End it, and whatever it has started, if they have not ended."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
         self._watch.join()
         self._said.close()
 
@@ -70,6 +62,3 @@ class Program:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-_VARIABLES = {"address": "connect"}

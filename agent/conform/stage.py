@@ -72,9 +72,12 @@ class Stage:
         self.identity = self._session.identity
         self.address = self._session.locators()[0]
         self._session.watch(self._see)
-        self._session.collect([estimate(node), EVENT, ACCOUNT])
-        for topic, model in ((joining, Joining), (ready, Ready), (leaving, Leaving)):
-            self._listen(topic(self._who), model)
+        self._models: dict[str, type[Word]] = {
+            joining(self._who): Joining,
+            ready(self._who): Ready,
+            leaving(self._who): Leaving,
+        }
+        self._session.collect([estimate(node), EVENT, ACCOUNT, *self._models])
 
     def __enter__(self) -> Self:
         return self
@@ -97,7 +100,7 @@ class Stage:
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0.0:
             with suppress(Empty):
-                heard = self._queue.get(timeout=left)()
+                heard = self._read(self._queue.get(timeout=left)())
                 if isinstance(heard, Heard):
                     return heard
         return None
@@ -137,11 +140,12 @@ class Stage:
         if who == self._who and session:
             self.hand_over(Came(session) if present else Gone(session))
 
-    def _listen(self, topic: str, model: type[Word]) -> None:
-        def decode(payload: bytes) -> Any:
-            try:
-                return model.model_validate_json(payload)
-            except ValidationError as error:
-                return Garbled(topic, f"not a {model.__name__}: {first_fault(error, {})}")
-
-        self._session.listen(topic, decode, overflow=lambda: None)
+    def _read(self, heard: Any) -> Any:
+        """A word, where it is one."""
+        model = self._models.get(heard.topic) if isinstance(heard, Sample) else None
+        if model is None:
+            return heard
+        try:
+            return model.model_validate_json(heard.payload)
+        except ValidationError as error:
+            return Garbled(heard.topic, f"not a {model.__name__}: {first_fault(error, {})}")

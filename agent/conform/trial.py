@@ -12,13 +12,15 @@ from typing import Any, Self
 
 from agent.conform.judge import Difference, Judge
 from agent.conform.play import Play
-from agent.conform.program import Program
+from agent.conform.program import Running
 from agent.conform.stage import Came, Ended, Garbled, Gone, Heard, Stage
 from agent.contract.keys import COORDINATOR, MODE, PLANT, RECORDER, estimate, measurement, node_who, participants
-from agent.contract.messages import Acknowledged, Control, Estimate, Joining, Leaving, Message, Ready
+from agent.contract.messages import Acknowledged, Control, Joining, Leaving, Message, Ready
+from agent.guests import programs
 from agent.network.acquaintance import refuse_version
 from agent.network.words import Replayed, Sample
 
+RUN = "conform"
 KEPT = 3  # messages that the recorder acts as if it lacked them at the end
 
 
@@ -30,8 +32,9 @@ class Setting:
     gains: Path
     play: Play
     node: str
-    wait: float = 60.0  # seconds for the program to join, and to end
-    deadline: float = 10.0  # seconds for it to say what it is to say next
+    wait: float = 60.0  # seconds for the program to join
+    deadline: float = 10.0  # seconds for whatever it is to do next
+    end: float = 10.0  # seconds for it to end where it is to
     tolerance: float = 0.0
 
 
@@ -42,12 +45,9 @@ class Trial:
         """`first` is the number of the program's first message."""
         self.setting, self.play, self.node = setting, setting.play, setting.node
         self.who, self.own = node_who(setting.node), setting.play.gains.for_node(setting.node)
-        self.period, self._first, self._also = (
-            period,
-            first,
-            also,
-        )  # `also` stands in every message, as a later version might have it
-        self.stage = Stage("conform", setting.node)
+        self.period, self._first = period, first
+        self._also = also  # stands in every message, as a later version might have it
+        self.stage = Stage(RUN, setting.node)
         self.session = ""
         self.code: int | None = None
         self.sent: list[Sample] = []  # what the program has published
@@ -59,14 +59,10 @@ class Trial:
         self._asked = False
         self.judge: Judge | None = None
         self._may_end = False
-        told = {
-            "run": "conform",
-            "node": setting.node,
-            "address": self.stage.address,
-            "gains": str(setting.gains.resolve()),
-        }
+        told = {"run": RUN, "address": self.stage.address, "gains": str(setting.gains.resolve())}
         try:
-            self.program = Program(setting.command, told, ended=lambda code: self.stage.hand_over(Ended(code)))
+            program = programs({self.who: setting.command}, **told)[self.who]
+            self.program = Running(program, ended=lambda code: self.stage.hand_over(Ended(code)))
         except BaseException:
             self.stage.close()
             raise
@@ -148,7 +144,7 @@ class Trial:
         for who in others:
             stage.appear(who)
         self.until(lambda: self.session, "its token, session/.../...", seconds=setting.wait)
-        self.until(lambda: self.joined, "its word on joining")
+        self.until(lambda: self.joined, "its word on joining", seconds=setting.wait)
         assert self.joined is not None
         try:
             refuse_version(self.who, self.joined.version, own=version("peakmesh"))
@@ -159,10 +155,14 @@ class Trial:
         stage.appear(RECORDER)
 
     def meet_underway(self, step: int) -> None:
-        """The run goes on, and `step` is the next: the recorder greets the program with the number that it has come to."""
+        """The run goes on, and `step` is the next; the recorder says which number the program's next message has."""
         self.meet()
         self.order("start", step=step)
-        self.until(lambda: any(word.asks for word in self.ready), "its question to the recorder, ready with asks")
+        self.until(
+            lambda: any(word.asks for word in self.ready),
+            "its question to the recorder, ready with asks",
+            seconds=self.setting.wait,
+        )
         self.acknowledge(self._first, greets=self.who)
 
     def be_ready(self) -> None:
@@ -182,7 +182,7 @@ class Trial:
             "external": [],
             "reason": "",
             "gains": self.play.gains.digest(),
-            "identity": "conform",
+            "identity": RUN,
             "version": version("peakmesh"),
         }
         if self.period:
@@ -215,9 +215,9 @@ class Trial:
         self.stage.publish(node_who(name), estimate(name), self.play.estimates[name][k], also=self._also)
 
     def end(self, order: str, **facts: Any) -> None:
-        """The coordinator ends the run; the program answers for what the recorder lacks, until that says that it closes.
+        """The coordinator ends the run; the program answers for what the recorder lacks.
 
-        Then it ends by itself.
+        Once the recording is closed it ends by itself.
         """
         first, total = self._first + max(0, len(self.sent) - KEPT), self._first + len(self.sent)
         self.acknowledge(first)
@@ -225,7 +225,7 @@ class Trial:
         self.ask_again(first)
         self._may_end = True
         self.acknowledge(total, closed=True)
-        self.until(lambda: self.code is not None, "its end", seconds=self.setting.wait)
+        self.until(lambda: self.code is not None, "its end", seconds=self.setting.end)
         if order == "close" and self.code:
             raise Difference(f"it ended {_in_words(self.code)} after a good run, must be 0{self._last_words()}")
         if order == "stop" and not self.code:
@@ -235,14 +235,14 @@ class Trial:
         """What the recorder asks for must be what was published, to the last byte."""
         self.answers, self._asked = [], True
         self.stage.ask(first)
-        self.until(lambda: not self._asked, "an answer to the recorder's question", seconds=self.setting.wait)
+        self.until(lambda: not self._asked, "an answer to the recorder's question")
         for place, sent in enumerate(self.sent[first - self._first :]):
             answer, number = self.answers[place] if place < len(self.answers) else None, first + place
             if answer is None or answer[:3] != sent[:3]:
                 came = "nothing" if answer is None else "another message"
                 raise Difference(
-                    f"asked for its messages from number {first} on, it answered {came} for number {number}, must be what "
-                    "it had published",
+                    f"asked for its messages from number {first} on, it answered {came} for number {number}, must be "
+                    "what it had published",
                     field="replay",
                 )
 
@@ -251,14 +251,14 @@ class Trial:
         self._may_end = True
         self.program.interrupt()
         self.acknowledge(len(self.sent))  # so that it need not wait for that
-        self.until(lambda: self.code is not None, "its end after SIGTERM", seconds=self.setting.wait)
+        self.until(lambda: self.code is not None, "its end after SIGTERM", seconds=self.setting.end)
         self._refuse_success("SIGTERM")
 
     def vanish(self) -> None:
         """Everybody is gone at once."""
         self._may_end = True
         self.stage.close()
-        self.until(lambda: self.code is not None, "its end after everybody was lost", seconds=self.setting.wait)
+        self.until(lambda: self.code is not None, "its end after everybody was lost", seconds=self.setting.end)
         self._refuse_success("everybody was lost")
 
     def _refuse_success(self, after: str) -> None:

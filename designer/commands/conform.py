@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, listed
 if TYPE_CHECKING:
     from agent.conform.series import Try
     from agent.contract.gains import Gains
+    from designer.conformity import Network
 
 ABOUT = (
     "The command is told what to be by the variables PEAKMESH_CONNECT (an address), PEAKMESH_RUN, PEAKMESH_NODE and "
@@ -28,6 +28,12 @@ class _Trial(NamedTuple):
     name: str
     what: str
     attempt: Try
+    network: _Network | Network
+
+
+class _Network(NamedTuple):
+    """Gains of the user's, where designer.conformity has its own."""
+
     gains: Gains
     node: str
 
@@ -49,8 +55,8 @@ def add_conform(commands: Subcommands) -> None:
         help="for arithmetic other than float64 in the stated order: how far a number may be off what follows from the "
         "step before, as a part of the largest of its vector (not a bit)",
     )
-    conform.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to join, and to end (60)")
-    conform.add_argument("--deadline", type=positive, default=10.0, metavar="S", help="seconds for an estimate (10)")
+    conform.add_argument("--wait", type=positive, default=60.0, metavar="S", help="seconds to join (60)")
+    conform.add_argument("--deadline", type=positive, default=10.0, metavar="S", help="seconds for what is due (10)")
     conform.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -59,6 +65,7 @@ def conform_command(options: argparse.Namespace) -> int:
     from agent.conform.play import Play
     from agent.conform.series import SEED, STEPS, Result, tried
     from agent.conform.trial import Setting
+    from agent.guests import guests
 
     trials = _chosen(options)
     if options.list:
@@ -66,18 +73,22 @@ def conform_command(options: argparse.Namespace) -> int:
         return EXIT_GOOD
     if not options.program:
         raise InputError("there is no command to try: peakmesh conform -- ./my_node")
+    first = trials[0].network
+    (words,) = guests(first.gains, nodes={first.node: options.program}, sensors={}, plant=None).values()
     results: list[Result] = []
     with tempfile.TemporaryDirectory(prefix="peakmesh-") as folder:
         path = Path(folder) / "gains.json"
         for trial in trials:
-            trial.gains.save(path, force=True)
+            gains = trial.network.gains
+            gains.save(path, force=True)
             setting = Setting(
-                options.program,
+                words,
                 path if options.gains is None else options.gains,
-                Play(trial.gains, steps=STEPS, seed=SEED),
-                trial.node,
+                Play(gains, steps=STEPS, seed=SEED),
+                trial.network.node,
                 wait=options.wait,
                 deadline=options.deadline,
+                end=options.deadline,
                 tolerance=options.tolerance or 0.0,
             )
             results.append(tried(trial.name, trial.what, trial.attempt, setting))
@@ -106,14 +117,14 @@ def _trials(options: argparse.Namespace) -> Iterator[_Trial]:
     if (options.gains is None) != (options.node is None):
         raise InputError("--gains FILE and --node NAME go together: a network, and the node that the program is in it")
     if options.gains is not None:
-        gains, node = load_gains(options.gains), options.node
-        gains.problem.node_index(node)
-        yield _Trial("whole", f"node {node} of {gains.problem.name}", WHOLE, gains, node)
+        own: _Network | Network = _Network(load_gains(options.gains), options.node)
+        own.gains.problem.node_index(own.node)
+        yield _Trial("whole", f"node {own.node} of {own.gains.problem.name}", WHOLE, own)
     else:
-        from designer.conformity import networks
+        from designer.conformity import NETWORKS
 
-        for network in networks():
-            yield _Trial(network.name, network.what, WHOLE, network.gains, network.node)
-        gains, node = network.gains, network.node  # the last has everything
+        for name, network in NETWORKS.items():
+            yield _Trial(name, network.what, WHOLE, network)
+        own = network
     for name, (what, attempt) in MORE.items():
-        yield _Trial(name, what, attempt, gains, node)
+        yield _Trial(name, what, attempt, own)
