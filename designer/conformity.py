@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 from agent.contract.gains import Certificate, Gains, Solver
@@ -28,11 +28,16 @@ class Network:
     node: str
     change: Change = lambda document: None
 
-    @cached_property
+    @property
     def gains(self) -> Gains:
-        document = find(self.problem).document()
-        self.change(document)
-        return _consensus(Problem.from_document(document))
+        return _gains_in(self)
+
+
+@cache
+def _gains_in(network: Network) -> Gains:
+    document = find(network.problem).document()
+    network.change(document)
+    return _consensus(Problem.from_document(document))
 
 
 def _see_losses(document: dict[str, Any]) -> None:

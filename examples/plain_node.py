@@ -93,13 +93,15 @@ def heed(topic, payload, at):
         (present.add if word else present.discard)(who[0])
         if who[0] == "coordinator" and not word and said["control"]["order"] != "close":
             raise SystemExit("the coordinator was lost")
-    else:
+    elif word.get("order") != "start" or word["cast"].get(WHO) == IDENTITY:
         said[kind] = word
         kept[:] = [sent for sent in kept if sent[0] >= said["acknowledged"]["received"].get(WHO, 0)]
         if kind == "control" and word["order"] in ("close", "stop"):
             while "recorder" in present and not said["acknowledged"]["closed"]:
                 heed(*inbox.get())
             raise SystemExit(word["reason"] or not said["acknowledged"]["closed"] or bool(kept))
+    elif WHO in word["cast"]:
+        raise SystemExit("another process has this name in the run")
 
 
 def wait(condition, *about):
@@ -131,7 +133,7 @@ def run(steps):
     declared += [tokens.declare_token(BASE + own) for own in (f"session/{WHO}/{IDENTITY}", f"alive/{WHO}")]
     wait({"coordinator"}.issubset, present)
     say("joining", version="0.1.0", listen="none", machine="", lease=20.0, lacks=sorted(linked - present))
-    wait(lambda: linked <= present or said["control"]["order"])
+    wait(lambda: linked <= present or said["control"]["order"] == "start")
     say("ready", gains=digest)
     wait(lambda: said["control"]["order"] == "start")
     steps(said["control"])

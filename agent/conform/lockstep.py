@@ -53,6 +53,15 @@ def deserted(setting: Setting) -> str:
         return f"code {trial.code} after everybody was lost"
 
 
+def namesake(setting: Setting) -> str:
+    """Another process has its name, and the run begins with that one."""
+    with Trial(setting) as trial:
+        trial.meet()
+        trial.be_ready()
+        trial.cast_another()
+        return f"code {trial.code} after another was cast"
+
+
 def _some_steps(setting: Setting) -> Trial:
     trial = Trial(setting)
     try:

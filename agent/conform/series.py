@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from agent.conform.judge import Difference
-from agent.conform.lockstep import deserted, interrupted, later, stopped, whole
+from agent.conform.lockstep import deserted, interrupted, later, namesake, stopped, whole
 from agent.conform.paced import FATES, joined_late, paced
 from agent.conform.trial import Setting
 
@@ -17,6 +17,7 @@ Try = Callable[[Setting], str]
 # every network is tried whole; these in one of them
 MORE: dict[str, tuple[str, Try]] = {
     "later": ("messages of a later version, with a field more", later),
+    "twice": ("the run begins with another of its name", namesake),
     "stop": ("the coordinator stops the run", stopped),
     "signal": ("the program is asked to end", interrupted),
     "lost": ("everybody else is lost", deserted),

@@ -175,7 +175,8 @@ class Trial:
 
     def order(self, order: str, **facts: Any) -> None:
         """The coordinator's word to everybody."""
-        control = {
+        others = dict.fromkeys(participants(self.play.gains.problem), self.stage.identity)
+        control: dict[str, Any] = {
             "steps": self.play.steps,
             "seed": self.play.seed,
             "window": 32,
@@ -184,6 +185,7 @@ class Trial:
             "gains": self.play.gains.digest(),
             "identity": RUN,
             "version": version("peakmesh"),
+            "cast": others | {self.who: self.session} if order == "start" else {},
         }
         if self.period:
             control |= {"period": self.period, "measure_by": 0.4, "hear_by": 0.8}
@@ -245,6 +247,15 @@ class Trial:
                     "what it had published",
                     field="replay",
                 )
+
+    def cast_another(self) -> None:
+        """The coordinator begins with another process of the program's name; the program is to go."""
+        self._may_end = True
+        self.order("start", cast={self.who: f"{self.session}-another"})
+        self.until(lambda: self.code is not None, "its end after another was cast", seconds=self.setting.end)
+        if self.sent:
+            raise Difference(f"it published on {self.sent[0].topic} in a run that began with another of its name")
+        self._refuse_success("another was cast")
 
     def interrupt(self) -> None:
         """Somebody wants the program to end; it does, and not as after a good run."""

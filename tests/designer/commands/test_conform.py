@@ -17,7 +17,7 @@ PLAIN, PACED = (str(ROOT / "examples" / name) for name in ("plain_node.py", "pac
 OURS = [sys.executable, "-m", "agent", "node", "{gains}", "--deadline", str(PATIENCE)]
 PATIENT = ["--wait", str(PATIENCE), "--deadline", str(PATIENCE)]
 ALL = ["ideal", "lossy", "seen", "links", "unbiased", "sizes", "all"]
-MORE = ["later", "stop", "signal", "lost", "paced", "again"]
+MORE = ["later", "twice", "stop", "signal", "lost", "paced", "again"]
 
 
 def conform(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, Any]]:
@@ -35,7 +35,7 @@ def test_a_node_in_plain_python_passes(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_our_own_node_passes(capsys: pytest.CaptureFixture[str]) -> None:
     """So what is played for it is what a node meets; it is told by the words of its command, too."""
-    trials = ["all", "later", "signal", "paced", "again"]
+    trials = ["all", "later", "twice", "signal", "paced", "again"]
     only = [word for trial in trials for word in ("--only", trial)]
     code, said = conform(capsys, *PATIENT, *only, "--", *OURS, "--node", "{node}", "--run", "{run}")
     assert [trial["says"] for trial in said["trials"] if not trial["passed"]] == []
