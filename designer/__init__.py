@@ -11,5 +11,6 @@ the design      decay: whether errors die out; synthesis: one method or another;
 other answers   analysis: somebody else's gains; ranking: gains beside others; stacked: gains as one matrix
                 for each mode; what_if: without a node or a link; sweep: over values of a key; reproduce: the paper's
                 table; simulation: thousands of runs; show: what a file is; compare: two recordings beside each other
+                conformity: the networks that a program is tried in which takes a node's place
 the machine     workers: many designs or runs at once; cli: the program
 """

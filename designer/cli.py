@@ -17,6 +17,7 @@ from agent.contract.errors import EXIT_INPUT
 from designer.commands import (
     analyse,
     compare,
+    conform,
     design,
     export,
     identify,
@@ -64,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reproduce.add_reproduce(commands)
     show.add_show(commands)
     add_roles(commands)
+    conform.add_conform(commands)
     watch.add_watch(commands)
     keys.add_keys(commands)
     add_doctor(commands)

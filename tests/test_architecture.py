@@ -39,6 +39,7 @@ ROOMS = {
     "agent.children": "",
     "agent.guests": "",
     "agent.launch": "agent.children agent.contract.recording agent.guests agent.plan agent.signals",
+    "agent.conform": "agent.estimates agent.filter agent.guests agent.network agent.roles",
     "agent.doctor": "agent.children agent.network agent.roles",
     "agent.commands": "agent.authority agent.contract.recording agent.doctor agent.faults agent.guard agent.guests "
     "agent.launch agent.network agent.plan agent.roles",
@@ -67,6 +68,7 @@ ROOMS = {
     "designer.lmi designer.model designer.proof designer.search designer.stacked",
     "designer.ranking": "designer.analysis designer.box designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
+    "designer.conformity": "designer.model designer.problems designer.search",
     "designer.what_if": "designer.gain designer.ladder designer.lmi designer.model designer.proof designer.search "
     "designer.synthesis designer.workers",
     "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
@@ -82,11 +84,12 @@ ROOMS = {
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",
     "designer.show": "agent.contract.recording designer.problems",
-    "designer.commands": "agent.commands agent.contract.recording agent.embed agent.signals designer.analysis "
-    "designer.beyond_gamma designer.box designer.compare designer.diagnosis designer.export designer.gain "
-    "designer.identify designer.ladder designer.problems designer.proof designer.ranking designer.replay "
-    "designer.report designer.reproduce designer.search designer.show designer.simulation "
-    "designer.stacked designer.sweep designer.synthesis designer.watch designer.what_if",
+    "designer.commands": "agent.commands agent.conform agent.contract.recording agent.embed agent.guests "
+    "agent.signals designer.analysis designer.beyond_gamma designer.box designer.compare designer.conformity "
+    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
+    "designer.proof designer.ranking designer.replay designer.report designer.reproduce designer.search "
+    "designer.show designer.simulation designer.stacked designer.sweep designer.synthesis designer.watch "
+    "designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
     # the library, whose source stands in designer/library/

@@ -21,7 +21,7 @@ DOCUMENTS = {path.name: path.read_text() for path in [*ROOT.glob("*.md"), *(ROOT
 DOCUMENTS["recordings/README.md"] = (ROOT / "recordings" / "README.md").read_text()
 FILES = {
     path.relative_to(ROOT).as_posix(): path.read_text()
-    for folder in ("agent", "designer", "benchmarks", "docs", "tests", "tools")
+    for folder in ("agent", "designer", "benchmarks", "docs", "examples", "tests", "tools")
     for path in (ROOT / folder).rglob("*.py")
 }
 

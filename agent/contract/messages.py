@@ -6,10 +6,13 @@ Data messages are flat JSON objects with a `step`; what is on the wire is what i
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 import struct
+from importlib.metadata import version
 from typing import Literal, NamedTuple, Self
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, ValidationError
 
 from agent.contract.frozen import Frozen
 
@@ -23,7 +26,10 @@ def beyond_ceiling(*vectors: list[float]) -> bool:
 
 
 class Message(Frozen):
-    """Flat and finite: NaN and infinity are refused, unknown fields too, and numbers in quotes."""
+    """Flat and finite: NaN and infinity are refused, unknown fields too, and numbers in quotes.
+
+    Unknown fields are refused but in messages that say that they are of a later version: see `decode`.
+    """
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -35,8 +41,40 @@ class Message(Frozen):
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Raises pydantic.ValidationError for anything else than this message."""
-        return cls.model_validate_json(payload)
+        """Raises pydantic.ValidationError for anything else than this message.
+
+        Fields that a later version of the same series has added are left out, where the message says that it is of one.
+        """
+        try:
+            return cls.model_validate_json(payload)
+        except ValidationError as error:
+            if (known := _known_of_a_later_version(cls, payload, error)) is None:
+                raise
+        return cls.model_validate_json(known)
+
+
+def _known_of_a_later_version(model: type[Message], payload: bytes, error: ValidationError) -> bytes | None:
+    """A message without the fields that are unknown here; None where its `version` is none to have others.
+
+    Whoever adds a field to a message has it say `version`, as a field, wherever the new one is not at its default.
+    """
+    if any(fault["type"] != "extra_forbidden" for fault in error.errors(include_url=False, include_input=False)):
+        return None
+    try:
+        document = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    if not is_later(document.get("version"), than=version("peakmesh")):
+        return None
+    return json.dumps({name: document[name] for name in model.model_fields if name in document}).encode()
+
+
+def is_later(text: object, *, than: str) -> bool:
+    """Whether a version is later than another, and of the same series: its first two numbers are the same."""
+    numbers, own = (re.fullmatch(r"(\d{1,9})\.(\d{1,9})\.(\d{1,9})", str(some)) for some in (text, than))
+    if numbers is None or own is None:
+        return False
+    return numbers.groups()[:2] == own.groups()[:2] and int(numbers[3]) > int(own[3])
 
 
 class Mode(Message):

@@ -97,6 +97,16 @@ class Session:
         self._declared.append(subscriber)
         return Channel(topic, subscriber.handler)
 
+    def collect(self, topics: Iterable[str]) -> None:
+        """Have the messages of several topics handed over, in the order in which they were sent on a link."""
+
+        def hear(sample: zenoh.Sample) -> None:
+            self._hand_over(lambda: _sample(topic_of(str(sample.key_expr)), sample))
+
+        for topic in topics:
+            handler: Any = zenoh.handlers.Callback(hear, indirect=False)
+            self._declared.append(self._zenoh.declare_subscriber(key(self._run, topic), handler))
+
     def overhear(self) -> Channel:
         """Receive what is shown to viewers, of every topic; what is not taken in time goes, the oldest first."""
         kept: Any = zenoh.handlers.RingChannel(CAPACITY)

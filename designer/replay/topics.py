@@ -154,7 +154,7 @@ class Topic:
         self.beyond: list[tuple[int, str]] = []  # steps and numbers beyond the ceiling
         self.unreadable = Sentences()  # messages that are none at all
         self.places, self.words, self._may_be_empty = places, words, may_be_empty
-        self._decode = model.__pydantic_validator__.validate_json  # what Message.decode calls
+        self._model, self._decode = model, model.__pydantic_validator__.validate_json  # what Message.decode calls
         self._get = attrgetter(*places) if len(places) > 1 else None
         self._tells_nothing = model is Estimate and "told" not in words
         self._widths = tuple(at.stop - at.start for at in places.values())
@@ -168,7 +168,7 @@ class Topic:
     def add(self, logged: Logged, columns: Columns, *, planned: int, modes: Words, senders: Senders) -> int:
         """Take in a message; returns its step, -1 where it cannot be read."""
         try:
-            message = self._decode(logged.payload)
+            message = self._read(logged.payload)
         except ValidationError as error:
             words = error.errors(include_url=False)[0]["msg"].lower()
             self.unreadable.add(f"{self.topic}, number {logged.number}: {words}")
@@ -193,6 +193,12 @@ class Topic:
         if len(self._steps) == _AT_ONCE:
             self.settle(columns)
         return step
+
+    def _read(self, payload: bytes) -> Any:
+        try:
+            return self._decode(payload)
+        except ValidationError:
+            return self._model.decode(payload)  # one of a later version, perhaps
 
     def _vectors(self, message: Any) -> tuple[list[float], ...]:
         if self._get is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from importlib.metadata import version
 from typing import Any
 
 import pytest
@@ -95,6 +96,39 @@ def test_a_step_is_a_natural_number_of_64_bits(step: bytes) -> None:
 def test_missing_and_unknown_fields_are_refused(payload: bytes) -> None:
     with pytest.raises(ValidationError):
         Mode.decode(payload)
+
+
+def after(last: int) -> str:
+    """The version that comes `last` versions after this one, in the same series."""
+    first, second, third = version("peakmesh").split(".")
+    return f"{first}.{second}.{int(third) + last}"
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_what_a_later_version_says_besides_is_left_out(message: Message) -> None:
+    """To the last bit: what is known of it is what it was."""
+    more = b',"reason":{"of":["any",1e-320]},"version":"' + after(1).encode() + b'"}'
+    assert type(message).decode(message.encode()[:-1] + more) == message
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        f'"version":"{after(0)}"',
+        f'"version":"{after(-1)}"',
+        '"version":"9.9.9"',
+        '"version":"later"',
+        '"version":""',
+        '"version":7',
+        '"version":[]',
+        f'"version":"{after(1)}","index":0.5',
+        f'"version":"{after(1)}","index":NaN',
+    ],
+)
+def test_only_a_later_version_may_say_more(said: str) -> None:
+    """Of the same series, and nothing else may be wrong with what it says."""
+    with pytest.raises(ValidationError):
+        Mode.decode(f'{{"step":0,"mode":"1","more":1,{said}}}'.encode())
 
 
 @pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)

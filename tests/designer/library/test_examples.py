@@ -60,7 +60,7 @@ def run(name: str, *arguments: object) -> tuple[list[str], int]:
 def test_every_example_is_in_the_table() -> None:
     assert set(re.findall(r"`python (\w+\.py)", (EXAMPLES / "README.md").read_text())) == {
         path.name for path in EXAMPLES.glob("*.py")
-    } == {"sweep.py", "live.py", "audit.py", "sensor.py"}  # fmt: skip
+    } == {"sweep.py", "live.py", "audit.py", "sensor.py", "plain_node.py", "paced_node.py"}  # fmt: skip
 
 
 def test_sweep(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,18 @@ def next_to(item: Item) -> list[Item]:
     digits = numbers[-1][0]
     other = digits[:-1] + (b"1" if digits[-1:] != b"1" else b"2")
     return [item._replace(payload=item.payload[:start] + other + item.payload[end:])]
+
+
+def test_a_run_with_nodes_of_a_later_version_is_what_was_sent(tmp_path: Path) -> None:
+    """They say more than this version knows, and say that they are later."""
+    first, second, third = version("peakmesh").split(".")
+    more = {"reason": [0.5], "version": f"{first}.{second}.{int(third) + 1}"}
+    sent = [
+        message._replace(document=message.document | more) if message.topic.endswith("/estimate") else message
+        for message in simulate(GAINS, steps=STEPS)
+    ]
+    verdict = replay(record(tmp_path / "run.mcap", GAINS, sent, steps=STEPS))
+    assert (verdict.exit_code, verdict.evidence.checked, verdict.notes) == (0, MESSAGES, ())
 
 
 def test_an_honest_run_is_what_was_sent(honest: Path) -> None:
