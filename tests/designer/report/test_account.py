@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_recordings import observer_gains, random_gains, random_problem, real_problem, record, simulate
-from places import GOLDEN, ROOT
+from places import GOLDEN
 from reports import account_of, recorded
 
 from agent.contract import schedule
