@@ -40,7 +40,7 @@ def run(bus: Bus, gains: Gains) -> None:
                 bus.guard.refuse(MODE, UNTIMELY)
                 continue
             if start.period:
-                if step < plant.step:
+                if step < max(plant.step, start.step):
                     continue  # a coordinator that has come back gives out again what the recorder has not got
                 suffer(ordeal.due(step))
                 if plant.step or not start.step:
