@@ -427,6 +427,7 @@ def test_the_command_tells_what_it_did(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "new/node2").iterdir()) == [
         "node_2.c",
         "node_2.h",
+        "node_2_run.h",
         "node_2_selftest.c",
     ]
 
