@@ -7,7 +7,7 @@ a node's step   inbox: what must be there before it; filter: eqs. (4) and (5); p
 the clock       pacing: a run against it, as data; faults: what such a run is to survive
 a whole run     plan: what the coordinator decides; receipts: what the recorder has; launch: every role on this machine
                 nursery: the process that they are forked from; children: how it is spoken to
-                guests: programs of the user's in place of roles
+                guests: programs of the user's in place of roles; within: roles in a thread of this process
                 authority: everybody's certificates; guard: what may come in; refusals: what is told of the rest
 the machine     cli: the program; signals: what asks it to end; doctor: whether a run would go well
 """
