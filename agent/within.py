@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 from agent.contract.errors import PeakmeshError, RunBroken
@@ -68,14 +69,14 @@ class Within:
         self._thread.join(PATIENCE)
 
     def _play(self) -> None:
-        try:
-            with Bus(self._network, run=self._run, who=self._who) as bus:
-                with self._lock:
-                    self._bus = bus
-                    if self._is_closed:
-                        return
+        with suppress(PeakmeshError), Bus(self._network, run=self._run, who=self._who) as bus:
+            with self._lock:
+                self._bus = bus
+                if self._is_closed:
+                    return
+            try:
                 self._role(bus)
-        except PeakmeshError:
-            pass
-        except Exception as error:  # whatever it is, somebody is told
-            self._error = error
+            except PeakmeshError:
+                raise
+            except Exception as error:  # noted while we are still there: then the run ends
+                self._error = error
