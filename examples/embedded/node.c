@@ -145,7 +145,7 @@ static void on_mode(z_loaned_sample_t *sample, void *context)
 static void on_measurement(z_loaned_sample_t *sample, void *context)
 {
     char text[LONGEST];
-    heard_t message;
+    heard_t message = {.index = 0};
     (void)context;
     read_text(z_sample_payload(sample), text);
     message.step = whole(text, "\"step\":", -1);
@@ -157,7 +157,7 @@ static void on_measurement(z_loaned_sample_t *sample, void *context)
 static void on_estimate(z_loaned_sample_t *sample, void *context)
 {
     char text[LONGEST];
-    heard_t message;
+    heard_t message = {.index = 0};
     size_t sender = (size_t)(uintptr_t)context;
     read_text(z_sample_payload(sample), text);
     message.step = whole(text, "\"step\":", -1);
@@ -170,6 +170,7 @@ static void on_control(z_loaned_sample_t *sample, void *context)
 {
     char text[LONGEST];
     const char *reason, *period;
+    size_t i;
     (void)context;
     read_text(z_sample_payload(sample), text);
     z_mutex_lock(z_loan_mut(lock));
@@ -184,7 +185,11 @@ static void on_control(z_loaned_sample_t *sample, void *context)
         run.closed = 1;
     else if (strstr(text, "\"order\":\"stop\"")) {
         reason = after(text, "\"reason\":\"");
-        snprintf(run.reason, sizeof run.reason, "%.*s", reason ? (int)strcspn(reason, "\"") : 0, reason ? reason : "");
+        for (i = 0; reason && *reason && *reason != '"' && i < sizeof run.reason - 1; reason++) {
+            if (*reason == '\\' && reason[1]) /* what is escaped is a quotation mark */
+                reason++;
+            run.reason[i++] = *reason == '"' ? '\'' : *reason;
+        }
         run.stopped = 1;
     }
     wake();

@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import random
+import re
+import shlex
 import shutil
+import signal
 import struct
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
+from made_recordings import observer_gains, real_problem
 from places import ROOT
+from runs import child, numbers_of, roles_left, run_here
 
+from agent.contract.errors import RunBroken
+from agent.contract.gains import Gains
 from agent.contract.messages import Measurement
 from agent.contract.schedule import DELIVERIES, Stream
+from agent.embed import export
+from agent.guests import Guests, guests
+from designer.replay import replay
 
 SOURCES = ROOT / "examples" / "embedded"
+README = (SOURCES / "README.md").read_text()
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror", "-O2"]
 DRIVER = r"""
 #include "wire.h"
@@ -48,6 +61,13 @@ int main(void)
     return 0;
 }
 """
+
+
+class Network(NamedTuple):
+    """Where the gains are, and the nodes in C."""
+
+    gains: Path
+    nodes: Guests
 
 
 def compiler() -> str:
@@ -111,3 +131,69 @@ def test_draws_are_those_of_everybody(wire: Path) -> None:
                 questions += [f"r {seed} {DELIVERIES} {step} {width} {place}" for place in range(width)]
                 expected += stream.at(step).tolist()
     assert [float.fromhex(text) for text in answers(wire, questions)] == expected
+
+
+@pytest.fixture(scope="module")
+def zenoh_pico() -> list[str]:
+    """What the compiler is told of it; its headers are not ours to be strict with."""
+    asked = [shutil.which("pkg-config") or "false", "--cflags", "--libs", "zenohpico"]
+    found = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
+    if found.returncode:
+        pytest.skip("zenoh-pico is not installed: pkg-config does not know zenohpico")
+    words = found.stdout.split()
+    return [f"-isystem{word[2:]}" if word.startswith("-I") else word for word in words]
+
+
+def built(gains: Gains, node: str, folder: Path, zenoh_pico: list[str]) -> str:
+    """The program of a node, by the command of the README, and strictly."""
+    name = export(gains, node, folder)["name"]
+    (command,) = re.findall(r"^cc (.*?) \$\(", README.replace("\\\n", ""), flags=re.MULTILINE)
+    words = [str(SOURCES / word) if word.endswith(".c") and "/" not in word else word for word in shlex.split(command)]
+    words = [word.replace("node_2", name).replace("node2", str(folder)) for word in words]
+    made = subprocess.run(
+        [compiler(), "-Wall", "-Wextra", "-Wconversion", "-Werror", f"-I{SOURCES}", *words, *zenoh_pico, "-lpthread"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (made.returncode, made.stderr) == (0, "")
+    return str(folder / "node")
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory: pytest.TempPathFactory, zenoh_pico: list[str]) -> Network:
+    """Seen losses, lossy links, unbiased gains and an unstable plant; every node is one in C."""
+    folder, gains = tmp_path_factory.mktemp("network"), observer_gains(real_problem(5, radius=1.02, ny=(1, 2, 1)))
+    gains.save(folder / "gains.json")
+    commands = {name: built(gains, name, folder / name, zenoh_pico) for name in gains.problem.node_names}
+    return Network(folder / "gains.json", guests(gains, nodes=commands, sensors={}, plant=None))
+
+
+def test_a_run_of_nodes_in_c_is_that_of_our_own(network: Network, tmp_path: Path) -> None:
+    """The same payloads, to the last byte; nothing is refused, and nobody ends badly."""
+    words: list[dict[str, Any]] = []
+    plan: dict[str, Any] = {"steps": 200, "seed": 3}
+    summary = run_here(network.gains, tmp_path / "c.mcap", guests=network.nodes, heed=words.append, **plan)
+    assert (summary["missing"], summary.get("refused"), [word for word in words if "warning" in word]) == (0, None, [])
+    run_here(network.gains, tmp_path / "ours.mcap", **plan)
+    assert numbers_of(tmp_path / "c.mcap") == numbers_of(tmp_path / "ours.mcap")
+    assert replay(tmp_path / "c.mcap").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "end"),
+    [(signal.SIGTERM, "it said: asked to end; .*, ended with code 143"), (signal.SIGKILL, ".*, died of SIGKILL")],
+)
+def test_a_node_in_c_that_is_asked_to_end(network: Network, tmp_path: Path, number: int, end: str) -> None:
+    """It says why; one that is killed is lost like any other."""
+    ours = {"node-n0": network.nodes["node-n0"]}
+    recording = tmp_path / "run.mcap"
+
+    def stop() -> None:
+        os.kill(child(os.getpid(), *ours["node-n0"]), number)
+
+    with pytest.raises(RunBroken, match=rf'^node "n0" was lost: .*{end}'):
+        run_here(network.gains, recording, at=10, do=stop, guests=ours)
+    assert roles_left() == {}
+    assert "agrees for what is there" in replay(recording).text()
