@@ -9,7 +9,8 @@ import json, sys
 from fractions import Fraction as Q
 from math import lcm, prod
 BITS, STEPS, ORDER = 96, 2000, 50  # of a rounded number; of a recursion; the longest [w; eta] that is tried
-KNOWN = "name plant A B M node C D arrival_probability loss weight link topology markov unbiased disturbance"  # keys
+KNOWN = "name plant A B M node C D arrival_probability loss weight link topology markov unbiased disturbance \
+tolerance uncertainty"  # keys; the last two change nothing of what is claimed of the numbers themselves
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
 eye = lambda size, by=Q(1): [[by * (i == j) for j in range(size)] for i in range(size)]
