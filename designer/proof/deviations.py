@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from flint import arb, arb_mat
 
-from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import add, part

@@ -123,8 +123,9 @@ def step(gains: Gains, truth: Truth, Y: Array, g: float) -> Array | None:
 
 def peak(problem: Problem, matrices: Matrices | None = None) -> Array:
     """M'M of every mode."""
-    M = problem.plant.M if matrices is None else matrices.M
-    M = np.hstack([np.tile(M - problem.plant.M, (problem.n, 1)), np.kron(np.eye(problem.n), problem.plant.M)])
+    off = 0.0 * problem.plant.M if matrices is None else matrices.M - problem.plant.M
+    z = [np.hstack([off, *(problem.plant.M * (i == j) for j in range(problem.n))]) for i in range(problem.n)]
+    M = np.vstack([weight * z_i for weight, z_i in zip(problem.weights, z, strict=True)])
     return np.tile(M.T @ M, (len(problem.topologies), 1, 1))
 
 
