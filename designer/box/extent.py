@@ -33,7 +33,7 @@ NAMES = {
     },
 }
 MATRICES = ("A", "B", "C", "D", "M")
-MOST_CORNERS, MOST_ENTRIES = 1024, 400
+MOST_CORNERS, MOST_ENTRIES, MOST_STATES = 1024, 400, 120
 
 
 class Interval(NamedTuple):
@@ -138,6 +138,12 @@ class _Sizes:
             )
         if len(box.entries) > MOST_ENTRIES:
             raise InputError(f"{where}: the box has {len(box.entries)} entries; up to {MOST_ENTRIES} are looked at")
+        states = (self.problem.n + 1) * self.problem.nx
+        if box.entries and states > MOST_STATES:
+            raise InputError(
+                f"{where}: with entries of matrices up to {MOST_STATES} states of plant and errors are looked at; "
+                f"{self.problem.name} has {states}"
+            )
         return box
 
     def _carries(self, box: Box) -> bool:

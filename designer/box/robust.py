@@ -20,6 +20,8 @@ from designer.proof.ball_model import Truth, told
 from designer.proof.by_vertices import ByVertices, prove, upper_bound
 from designer.proof.cube import Cube
 from designer.proof.findings import Verdict
+from designer.proof.recursion import Arithmetic
+from designer.proof.vertices_by_balls import VerticesByBalls
 
 _WIDTH = 1e-5  # of gamma^2 of the weights' model
 _HORIZON, _BEGINNING = 60, 30  # steps of the weights, and before them, from rest
@@ -58,7 +60,7 @@ class Robust(NamedTuple):
             "intervals": [[part.what, part.low, part.high] for part in self.box.intervals],
             "worst_found": self.found if math.isfinite(self.found) else None,
             "proved": self.gamma,
-            "why_not": None if self.gamma is not None else self._why_not,
+            "why_not": None if self.gamma is not None else self.why_not,
         }
 
     def lines(self) -> list[str]:
@@ -74,13 +76,13 @@ class Robust(NamedTuple):
             )
             lines.append(f"           worst found at {at}")
         if self.gamma is None:
-            lines.append(f"           no gamma is proved for the box: {self._why_not}")
+            lines.append(f"           no gamma is proved for the box: {self.why_not}")
         return lines
 
     def of_verify(self) -> list[str]:
         """For people, among what `verify` has proved."""
         if self.gamma is None:
-            return [f"within  {self.box.extent}: no gamma is proved for the box: {self._why_not}", *self._cuts()]
+            return [f"within  {self.box.extent}: no gamma is proved for the box: {self.why_not}", *self._cuts()]
         said = f"gamma = {self.gamma} is proved for every model of the box, one model or another at every step"
         return [f"within  {self.box.extent}: {said}; the worst found has {self.found:.6g}", *self._cuts()]
 
@@ -88,7 +90,8 @@ class Robust(NamedTuple):
         return [f"        {remark}" for remark in self.box.remarks()]
 
     @property
-    def _why_not(self) -> str:
+    def why_not(self) -> str:
+        """Where none is proved."""
         if not math.isfinite(self.found):
             return "a model in it is not mean-square stable, as far as floats tell"
         if self.verdict is None:
@@ -96,16 +99,16 @@ class Robust(NamedTuple):
         return str(self.verdict.failure)
 
 
-def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robust:
-    """The worst model that a search finds, and the least gamma for all: sought in floats, then proved."""
+def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, *, balls: bool = False) -> Robust:
+    """The worst model that a search finds, and the least gamma for all: sought in floats, then proved.
+
+    `balls`: and proved once more in ball arithmetic.
+    """
     found = worst(problem, K, H, box)
     if not math.isfinite(found.gain):
         return Robust(box, found, None)
-    every = sorted(corners(problem, box), key=lambda corner: _differs(corner, found.truth))  # the worst first
-    models = [Cube(problem, K, H, corner, box.entries) for corner in every]
-    nominal = told(problem)._replace(carry=box.carry)
-    likely = [real_model(problem, K, H, truth) for truth in (found.truth, nominal)]
-    least = _sought(models, likely, Operator(likely[1]), found.gain**2)
+    models, likely = _models(problem, K, H, box, found.truth)
+    least = _sought(models, likely, Operator(likely[-1]), found.gain**2)
     if least is None:
         return Robust(box, found, None)
     g, by, P = least
@@ -113,7 +116,41 @@ def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Robu
         verdict = prove(by, problem.mode_names, math.sqrt(g) * (1.0 + more), P)
         if verdict.holds:
             break
+    if balls and verdict.holds:
+        return Robust(box, found, proved_at(problem, K, H, box, found.truth, verdict.gamma, balls=True))
     return Robust(box, found, verdict)
+
+
+def proved_at(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth: Truth, gamma: float, *, balls: bool = False
+) -> Verdict | None:
+    """Whether gamma holds for every model of the box, with what the search takes for the proof; None: it finds nothing.
+
+    `truth`: a model of the box in which the worst w is like the worst of all. `balls`: in ball arithmetic.
+    """
+    models, likely = _models(problem, K, H, box, truth)
+    middle, P, mean, verdict = Operator(likely[-1]), None, None, None
+    for weights in (found for model in likely for above in _ABOVE if (found := weights_of(model, above)) is not None):
+        by = ByVertices(models, weights, mean)
+        if P is None:
+            P, mean = invariant(by, middle), by.mean
+        if P is not None and ends(by, P, gamma**2):
+            arithmetic: Arithmetic = by
+            if balls:
+                arithmetic = VerticesByBalls(problem, K, H, [model.truth for model in models], box.entries, by)
+            verdict = prove(arithmetic, problem.mode_names, gamma, P)
+            if verdict.holds:
+                break
+    return verdict
+
+
+def _models(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth: Truth
+) -> tuple[list[Cube], list[ErrorModel]]:
+    """What stands at the corners, the likely worst first; and models whose worst w makes weights, the nominal last."""
+    every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))
+    likely = [real_model(problem, K, H, each) for each in (truth, told(problem)._replace(carry=box.carry))]
+    return [Cube(problem, K, H, corner, box.entries) for corner in every], likely
 
 
 def _sought(

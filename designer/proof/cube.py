@@ -75,8 +75,9 @@ class Cube(ByFloats):
     """`ByFloats` for the model in the middle; `joint` and `above` for all."""
 
     def __init__(
-        self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None, entries: tuple[Entry, ...]
+        self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth, entries: tuple[Entry, ...]
     ) -> None:
+        self.truth = truth
         with ctx.workprec(BITS):
             balls = BallModel(problem, K, H, truth)
             self._begin(balls)

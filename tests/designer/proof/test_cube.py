@@ -141,5 +141,6 @@ def test_what_m_may_be_is_above_the_peak_of_every_m() -> None:
             off = np.zeros_like(problem.plant.M)
             off[0, 1] = sign * entry.radius
             M = np.hstack([np.tile(off, (problem.n, 1)), np.kron(np.eye(problem.n), problem.plant.M)])
+            M *= np.repeat(problem.weights, problem.nz)[:, None]
             rests.append(np.linalg.eigvalsh(above[0] - M.T @ M)[0])
         assert bool(min(rests) > -1e-9) is right
