@@ -7,19 +7,12 @@ import math
 from agent.contract.errors import InputError
 from agent.contract.gains import BoxClaim, Gains
 from designer.box.extent import Box, box_in, truth_at
-from designer.box.robust import Robust, proved_at, robust
+from designer.box.robust import Robust, proved_at
 from designer.box.worst import Worst
 
 
-def with_box(gains: Gains) -> Gains:
-    """The same gains, with what is proved of their problem's box; as they are where it has none."""
-    box = box_in(gains.problem)
-    if box is None or not gains.certificate.holds:
-        return gains
-    try:
-        found = robust(gains.problem, gains.K, gains.H, box)
-    except KeyboardInterrupt:  # what was designed is kept, without a claim for the box
-        return gains
+def with_claim(gains: Gains, found: Robust) -> Gains:
+    """The same gains, with what was found of them in the box that their problem has."""
     claim = BoxClaim(
         gamma=found.gamma,
         why_not=None if found.gamma is not None else found.why_not,

@@ -14,7 +14,9 @@ from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.analysis import certified, given
-from designer.box.claim import again, with_box
+from designer.box.claim import again, with_claim
+from designer.box.extent import box_in
+from designer.box.robust import robust
 from designer.cli import main
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, ladder_of
 from designer.problems.written import to_toml
@@ -39,7 +41,9 @@ def scalar(**more: Any) -> Problem:
 def claimed() -> Gains:
     problem = scalar()
     K, H = {"m": {"a": {"a": np.array([[0.8]])}}}, {"m": {"a": {"a": np.array([[0.4]])}}}
-    return with_box(certified(problem, given(problem, K, H, source="test", file=None)))
+    box = box_in(problem)
+    assert box is not None
+    return with_claim(certified(problem, given(problem, K, H, source="test", file=None)), robust(problem, K, H, box))
 
 
 def edited(folder: Path, **changes: Any) -> Path:
@@ -101,7 +105,6 @@ def test_a_claim_without_tolerances_is_refused() -> None:
     plain = gains.model_copy(update={"problem": problem, "problem_digest": problem.digest()})
     with pytest.raises(InputError, match="the problem has no tolerances"):
         again(plain)
-    assert with_box(plain) is plain
 
 
 def test_verify_proves_the_box_of_the_problem_that_it_is_given(
