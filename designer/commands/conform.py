@@ -13,7 +13,7 @@ from agent.commands.options import Subcommands, add_command, load_gains, positiv
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, listed
 
 if TYPE_CHECKING:
-    from agent.conform.series import Try
+    from agent.conform.series import Result, Try
     from agent.contract.gains import Gains
     from designer.conformity import Network
 
@@ -62,28 +62,42 @@ def add_conform(commands: Subcommands) -> None:
 
 def conform_command(options: argparse.Namespace) -> int:
     """`peakmesh conform -- COMMAND`."""
-    from agent.conform.play import Play
-    from agent.conform.series import SEED, STEPS, Result, tried
-    from agent.conform.trial import Setting
-    from agent.guests import guests
-
     trials = _chosen(options)
     if options.list:
         print("\n".join(f"{trial.name:<8} {trial.what}" for trial in trials))
         return EXIT_GOOD
     if not options.program:
         raise InputError("there is no command to try: peakmesh conform -- ./my_node")
-    first = trials[0].network
-    (words,) = guests(first.gains, nodes={first.node: options.program}, sensors={}, plant=None).values()
     results: list[Result] = []
+    for result in _results(options, trials):
+        results.append(result)
+        if not options.json:
+            print(result.text(), flush=True)
+    failed = sum(not result.passed for result in results)
+    if options.json:
+        print(json.dumps({"passed": not failed, "trials": [result.document() for result in results]}))
+    else:
+        print(f"{len(results) - failed} of {len(results)} trials passed")
+    return EXIT_NO if failed else EXIT_GOOD
+
+
+def _results(options: argparse.Namespace, trials: list[_Trial]) -> Iterator[Result]:
+    from agent.conform.play import Play
+    from agent.conform.series import SEED, STEPS, tried
+    from agent.conform.trial import Setting
+    from agent.guests import guests
+
+    first = trials[0].network
+    (command,) = guests(first.gains, nodes={first.node: options.program}, sensors={}, plant=None).values()
     with tempfile.TemporaryDirectory(prefix="peakmesh-") as folder:
-        path = Path(folder) / "gains.json"
         for trial in trials:
-            gains = trial.network.gains
-            gains.save(path, force=True)
+            gains, path = trial.network.gains, options.gains
+            if path is None:
+                path = Path(folder) / "gains.json"
+                gains.save(path, force=True)
             setting = Setting(
-                words,
-                path if options.gains is None else options.gains,
+                command,
+                path,
                 Play(gains, steps=STEPS, seed=SEED),
                 trial.network.node,
                 wait=options.wait,
@@ -91,15 +105,7 @@ def conform_command(options: argparse.Namespace) -> int:
                 end=options.deadline,
                 tolerance=options.tolerance or 0.0,
             )
-            results.append(tried(trial.name, trial.what, trial.attempt, setting))
-            if not options.json:
-                print(results[-1].text(), flush=True)
-    failed = sum(not result.passed for result in results)
-    if options.json:
-        print(json.dumps({"passed": not failed, "trials": [result.document() for result in results]}))
-    else:
-        print(f"{len(results) - failed} of {len(results)} trials passed")
-    return EXIT_NO if failed else EXIT_GOOD
+            yield tried(trial.name, trial.what, trial.attempt, setting)
 
 
 def _chosen(options: argparse.Namespace) -> list[_Trial]:
@@ -112,19 +118,20 @@ def _chosen(options: argparse.Namespace) -> list[_Trial]:
 
 
 def _trials(options: argparse.Namespace) -> Iterator[_Trial]:
-    from agent.conform.series import MORE, WHOLE
+    from agent.conform.lockstep import whole
+    from agent.conform.series import MORE
 
     if (options.gains is None) != (options.node is None):
         raise InputError("--gains FILE and --node NAME go together: a network, and the node that the program is in it")
     if options.gains is not None:
         own: _Network | Network = _Network(load_gains(options.gains), options.node)
         own.gains.problem.node_index(own.node)
-        yield _Trial("whole", f"node {own.node} of {own.gains.problem.name}", WHOLE, own)
+        yield _Trial("whole", f"node {own.node} of {own.gains.problem.name}", whole, own)
     else:
         from designer.conformity import NETWORKS
 
         for name, network in NETWORKS.items():
-            yield _Trial(name, network.what, WHOLE, network)
+            yield _Trial(name, network.what, whole, network)
         own = network
     for name, (what, attempt) in MORE.items():
         yield _Trial(name, what, attempt, own)
