@@ -47,6 +47,7 @@ def add_conform(commands: Subcommands) -> None:
     conform.add_argument("--gains", type=Path, metavar="FILE", help="in the network of these gains alone")
     conform.add_argument("--node", metavar="NAME", help="the node of --gains that the program is")
     conform.add_argument("--only", action="append", default=[], metavar="TRIAL", help="this trial; may be repeated")
+    conform.add_argument("--skip", action="append", default=[], metavar="TRIAL", help="not this one; may be repeated")
     conform.add_argument("--list", action="store_true", help="say what the trials are, and try nothing")
     conform.add_argument(
         "--tolerance",
@@ -111,10 +112,14 @@ def _results(options: argparse.Namespace, trials: list[_Trial]) -> Iterator[Resu
 def _chosen(options: argparse.Namespace) -> list[_Trial]:
     trials = list(_trials(options))
     names = [trial.name for trial in trials]
-    for name in options.only:
-        if name not in names:
-            raise InputError(f"--only {name}: there is no such trial; there are {listed(names)}")
-    return [trial for trial in trials if not options.only or trial.name in options.only]
+    for option, chosen in (("--only", options.only), ("--skip", options.skip)):
+        for name in chosen:
+            if name not in names:
+                raise InputError(f"{option} {name}: there is no such trial; there are {listed(names)}")
+    left = [name for name in options.only or names if name not in options.skip]
+    if not left:
+        raise InputError("--skip leaves nothing to try")
+    return [trial for trial in trials if trial.name in left]
 
 
 def _trials(options: argparse.Namespace) -> Iterator[_Trial]:
