@@ -11,6 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 #include <zenoh-pico.h>
 
 #include THIS_NODE /* node_2_run.h, of `peakmesh export --c --node 2` */
@@ -169,12 +170,16 @@ static void on_estimate(z_loaned_sample_t *sample, void *context)
 static void on_control(z_loaned_sample_t *sample, void *context)
 {
     char text[LONGEST];
-    const char *reason, *period;
+    const char *reason, *period, *begins;
     size_t i;
     (void)context;
     read_text(z_sample_payload(sample), text);
     z_mutex_lock(z_loan_mut(lock));
-    if (strstr(text, "\"order\":\"start\"")) {
+    begins = after(after(text, "\"cast\":{"), "\"" WHO "\":\""); /* the session that begins under our name */
+    if (strstr(text, "\"order\":\"start\"") && begins &&
+        (strncmp(begins, identity, strlen(identity)) || begins[strlen(identity)] != '"'))
+        is_taken = 1;
+    else if (strstr(text, "\"order\":\"start\"") && begins) {
         run.steps = whole(text, "\"steps\":", 0);
         run.window = whole(text, "\"window\":", AHEAD);
         run.seed = (uint64_t)whole(text, "\"seed\":", 0);
@@ -634,7 +639,7 @@ int main(void)
         forget_all(told[j]);
     clock_gettime(CLOCK_REALTIME, &now);
     snprintf(base, sizeof base, "peakmesh/%s/", name);
-    snprintf(identity, sizeof identity, "%011lld%09ld-c", (long long)now.tv_sec, now.tv_nsec);
+    snprintf(identity, sizeof identity, "%011lld%09ld-%ld", (long long)now.tv_sec, now.tv_nsec, (long)getpid());
     while (!is_open(address)) {
         if (signalled)
             return 128 + signalled;

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from here import here
 from made_recordings import observer_gains, real_problem
 from places import ROOT
 from runs import child, numbers_of, roles_left, run_here
@@ -197,3 +198,11 @@ def test_a_node_in_c_that_is_asked_to_end(network: Network, tmp_path: Path, numb
         run_here(network.gains, recording, at=10, do=stop, guests=ours)
     assert roles_left() == {}
     assert "agrees for what is there" in replay(recording).text()
+
+
+def test_a_node_in_c_conforms(network: Network) -> None:
+    """To all that is asked of a node in lock-step, the recorder's questions among it."""
+    ((command,),) = [words for who, words in network.nodes.items() if who == "node-n1"]
+    only = [word for trial in ("whole", "later", "twice", "stop", "signal", "lost") for word in ("--only", trial)]
+    done = here("conform", "--gains", network.gains, "--node", "n1", *only, "--", command)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "6 of 6 trials passed"), done.stdout
