@@ -5,7 +5,7 @@ Not in the paper: a node that sees its losses, messages that do not arrive, and 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,9 @@ class Pair(NamedTuple):
 
     x_hat: Array  # x_hat_j(k), (nx,)
     innovation: Array  # nu_j(k), (ny_j,)
+
+
+Step = Callable[[NodeGains, str, Mapping[str, Pair]], Array]  # what `step` is
 
 
 def innovation(gains: NodeGains, y: Array, x_hat: Array) -> Array:

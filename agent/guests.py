@@ -17,7 +17,7 @@ from agent.contract.keys import PLANT, in_words, node_who, sensor_who
 
 _VARIABLES = {"run": "PEAKMESH_RUN", "node": "PEAKMESH_NODE", "address": "PEAKMESH_CONNECT", "gains": "PEAKMESH_GAINS"}
 
-Guests = Mapping[str, Sequence[str]]  # by who they are: the words of the command
+Guests = Mapping[str, Sequence[str]]  # by who they are: the words of the command, none where somebody else starts it
 
 
 class Program(NamedTuple):
@@ -48,9 +48,7 @@ def _words(who: str, command: str | Sequence[str]) -> list[str]:
         words = shlex.split(command) if isinstance(command, str) else [str(word) for word in command]
     except ValueError as error:
         raise InputError(f"the command of {in_words(who)}, {command}, cannot be read: {error}") from None
-    if not words:
-        raise InputError(f"the command of {in_words(who)} is empty")
-    if shutil.which(words[0]) is None:
+    if words and shutil.which(words[0]) is None:
         raise InputError(f"the command of {in_words(who)}, {words[0]}, cannot be started: there is no such program")
     return words
 
@@ -58,7 +56,7 @@ def _words(who: str, command: str | Sequence[str]) -> list[str]:
 def programs(guests: Guests, *, run: str, address: str, gains: str) -> dict[str, Program]:
     """What to start, by who they are."""
     found = {}
-    for who, words in guests.items():
+    for who, words in ((who, words) for who, words in guests.items() if words):
         facts = {"run": run, "node": who.partition("-")[2], "address": address, "gains": gains}
         environment = {_VARIABLES[name]: value for name, value in facts.items()}
         found[who] = Program([_put_in(word, facts) for word in words], environment)

@@ -55,6 +55,8 @@ def launch(
     on to its end without a recording, as the plan allows, has the reason in its summary as `broken_off`.
     """
     began, guests = time.time(), guests or {}
+    if PLANT in guests and plan.needs_no_plant(gains.problem):
+        raise InputError("the plant is yours, but none takes part in a paced run where every node has a sensor")
     common = [str(gains_path), "--run", run, "--wait", str(wait), "--deadline", str(plan.deadline), "--child"]
     common += ["--keys", str(keys)] if keys is not None else []
     commands = {COORDINATOR: ["coordinator", *common, *_plan_options(plan), *(["--hosts"] if guests else [])]}
@@ -234,24 +236,26 @@ class _Crew:
         """What is not as it should be with guests, though the run has ended well."""
         for who in self._guests:
             if self._children[who].code:
-                yield f"{in_words(who)} did not end well after the run: {self._end_of(who)}"
+                yield f"{in_words(who)} did not end well: {self._end_of(who)}"
 
-    def _end_of(self, who: str) -> str:
-        """How a guest has ended."""
+    def _end_of(self, who: str, words: str = "") -> str:
+        """How a guest has ended; what it said, where that is not in `words`."""
         child, how = self._children[who], ""
         if child.was_killed and child.code == -signal.SIGKILL:
             how = "had not ended, and was killed"
         elif child.code is not None:
             how = f"ended with code {child.code}" if child.code >= 0 else f"died of {signal.Signals(-child.code).name}"
         said = child.last_words()
-        return f"its command, {shlex.join(self._commands[who])}, {how}{f', and said: {said}' if said else ''}"
+        return (
+            f"its command, {shlex.join(self._commands[who])}, {how}{f', and said: {said}' if said not in words else ''}"
+        )
 
     def _cause(self, words: str) -> str:
         """The last words of the child that the coordinator's `words` call lost."""
         for who, child in self._children.items():
             own = child.last_words()
             if who in self._guests and in_words(who) in words:
-                return f"; {self._end_of(who)}"
+                return f"; {self._end_of(who, words)}"
             if who != COORDINATOR and in_words(who) in words and child.code and own and own not in words:
                 return f"; it said: {own}"
         return ""

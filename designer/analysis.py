@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -212,10 +212,12 @@ def _unstacked(document: dict[str, Any], problem: Problem, path: Path) -> dict[s
     return {"K": K, "H": H}
 
 
-def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radius: bool = False) -> Analysis:
+def analyse(
+    problem: Problem, given: GivenGains, box: Box | None = None, *, radius: Literal["all", "cheap"] | None = None
+) -> Analysis:
     """The exact gain of the gains on the problem, what attains it, and what holds for every model of a box.
 
-    `radius`: how large boxes may be for a gamma that is a little larger.
+    `radius`: how large boxes may be for a gamma that is a little larger, of every shape or of those that take little.
     """
     from designer.lmi.multipliers import least_of_lmi  # loads a solver, which reading gains does not take
 
@@ -257,7 +259,9 @@ def analyse(problem: Problem, given: GivenGains, box: Box | None = None, *, radi
         unproved=verdict.failure,
         beyond=beyond_gamma(problem, given.K, given.H),
         robust=in_box,
-        radii=tuple(radii(problem, given.K, given.H, verdict.gamma)) if radius and verdict.holds else (),
+        radii=tuple(radii(problem, given.K, given.H, verdict.gamma, dear=radius == "all"))
+        if radius and verdict.holds
+        else (),
     )
 
 

@@ -143,7 +143,9 @@ def ladder_of(gains: Gains) -> Ladder:
     lmi = "the LMI" if beyond_paper(gains.problem) else "Theorem 2"
     theorem1 = proved.theorem1_gamma if proved.holds else None
     rungs = Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi, theorem1)
-    return rungs._replace(theorem2_least=proved.lmi_least)
+    box = proved.box if proved.holds else None
+    rungs = rungs._replace(theorem2_least=proved.lmi_least)
+    return rungs if box is None else rungs._replace(found_in_box=box.found, proved_in_box=box.gamma)
 
 
 def rounded_up(bound: float) -> str:

@@ -39,10 +39,11 @@ ROOMS = {
     "agent.children": "",
     "agent.guests": "",
     "agent.launch": "agent.children agent.contract.recording agent.guests agent.plan agent.signals",
-    "agent.conform": "agent.estimates agent.filter agent.guests agent.network agent.roles",
+    "agent.conform": "agent.estimates agent.filter agent.guard agent.guests agent.network agent.roles",
     "agent.doctor": "agent.children agent.network agent.roles",
     "agent.commands": "agent.authority agent.contract.recording agent.doctor agent.faults agent.guard agent.guests "
     "agent.launch agent.network agent.plan agent.roles",
+    "agent.within": "agent.filter agent.network agent.roles",
     "agent.cli": "agent.commands",
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",
@@ -95,10 +96,11 @@ ROOMS = {
     # the library, whose source stands in designer/library/
     "peakmesh.answers": "designer.analysis designer.problems designer.proof designer.replay designer.report "
     "designer.search designer.simulation designer.synthesis",
-    "peakmesh.running": "agent.commands agent.contract.recording agent.launch agent.plan designer.replay "
-    "peakmesh.answers",
     "peakmesh.sensors": "",
-    "peakmesh.mesh": "designer.replay peakmesh.answers peakmesh.running peakmesh.sensors",
+    "peakmesh.functions": "agent.within peakmesh.sensors",
+    "peakmesh.running": "agent.commands agent.contract.recording agent.guests agent.launch agent.plan designer.replay "
+    "peakmesh.answers peakmesh.functions peakmesh.sensors",
+    "peakmesh.mesh": "designer.replay peakmesh.answers peakmesh.functions peakmesh.running peakmesh.sensors",
     "peakmesh": "peakmesh.answers peakmesh.mesh peakmesh.running",
     "peakmesh.background": "agent.commands peakmesh peakmesh.running",
     "peakmesh.testing": "peakmesh peakmesh.mesh",

@@ -104,7 +104,11 @@ def test_what_it_does_not_know_it_does_not_decide(check, tmp_path: Path) -> None
     assert check(_of_the_first_node(tmp_path, "delay", 0.5))[0] == UNDECIDED
 
 
-def _of_the_first_node(folder: Path, key: str, value: float) -> Path:
+def test_what_may_be_off_changes_nothing_of_what_is_claimed_of_the_numbers_as_they_are(check, tmp_path: Path) -> None:
+    assert check(_of_the_first_node(tmp_path, "tolerance", {"C": "1%", "arrival_probability": 0.1}))[0] == PROVED
+
+
+def _of_the_first_node(folder: Path, key: str, value: object) -> Path:
     """A correct file of which the problem says this of its first node."""
     document = json.loads(CORRECT[0].read_text())
     document["problem"]["node"][0][key] = value

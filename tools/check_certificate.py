@@ -9,7 +9,7 @@ import json, sys
 from fractions import Fraction as Q
 from math import lcm, prod
 BITS, STEPS, ORDER = 96, 2000, 50  # of a rounded number; of a recursion; the longest [w; eta] that is tried
-KNOWN = "name plant A B M node C D arrival_probability loss weight link topology markov unbiased disturbance"  # keys
+KEYS = "name plant node arrival_probability loss weight link topology markov unbiased disturbance tolerance uncertainty"
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
 eye = lambda size, by=Q(1): [[by * (i == j) for j in range(size)] for i in range(size)]
@@ -32,7 +32,7 @@ def chance(name, p, form):  # 1 with probability p, else 0, times a form: p and 
     return more | {key: scaled(X, p) for key, X in form.items()}
 def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for every mode; M'M; Pi; lengths of w and x
     (A, B, M), nodes, modes, nu = (p["plant"][letter] for letter in "ABM"), p["node"], [], []
-    assert {*p, *p["plant"], *sum(map(list, nodes), [])} <= {*KNOWN.split()}, f"the problem says more than {KNOWN}"
+    assert {*p, *p["plant"], *sum(map(list, nodes), [])} <= {*KEYS.split(), *"ABCDM"}, f"it says more than {KEYS}"
     names, beta, seen = zip(*((v["name"], v["arrival_probability"], v.get("loss") == "seen") for v in nodes))
     rho = {(link["receiver"], link["sender"]): link["delivery_probability"] for link in p.get("link") or ()}
     nw, nx, n = len(B[0]), len(A), len(nodes)

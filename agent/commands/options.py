@@ -76,7 +76,7 @@ def add_guest_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="COMMAND", help="start this in place of the plant")
 
 
-def guests_of(options: argparse.Namespace, gains: Gains, plan: Plan) -> dict[str, list[str]]:
+def guests_of(options: argparse.Namespace, gains: Gains) -> dict[str, list[str]]:
     """What the options of `add_guest_options` ask for. Raises InputError where that cannot be started."""
     from agent.guests import guests
 
@@ -85,14 +85,14 @@ def guests_of(options: argparse.Namespace, gains: Gains, plan: Plan) -> dict[str
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"--{what} {name}=...: it is there twice")
-    if options.plant is not None and plan.needs_no_plant(gains.problem):
-        raise InputError(f"--plant {options.plant}: no plant takes part in a paced run where every node has a sensor")
+    if options.plant is not None and not options.plant.strip():
+        raise InputError("--plant is empty; it takes a command")
     return guests(gains, nodes=dict(options.node), sensors=dict(options.sensor), plant=options.plant)
 
 
 def _guest(text: str) -> tuple[str, str]:
     name, equals, command = text.partition("=")
-    if not (name and equals and command):
+    if not (name and equals and command.strip()):
         raise argparse.ArgumentTypeError(f'{text!r} is not NODE=COMMAND, such as 2="./my_node"')
     return name, command
 

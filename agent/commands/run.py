@@ -75,7 +75,7 @@ def run_gains(
     external, sensors = options.external, [name for name, _ in options.sensor]
     options.external = list(dict.fromkeys([*external, *sensors]))
     plan = plan_of(options, gains)
-    guests = guests_of(options, gains, plan)
+    guests = guests_of(options, gains)
     run = f"{gains.problem.name}-{os.urandom(4).hex()}"
     recording = options.output or default_recording(run)
     refuse_recording(recording, force=options.force)

@@ -49,6 +49,8 @@ class Judge:
         if stamp is None:
             why = "has a stamp that nobody can read" if flaw else "has no stamp: no attachment"
             raise Difference(f"a message on {topic} {why}", field="stamp")
+        if flaw:
+            raise Difference(f"a message on {topic} stands under the key of another than its sender", field="key")
         number, self._number = self._number, self._number + 1
         marks: dict[str, tuple[Any, Any]] = {
             "sender": (stamp.sender, self._who),

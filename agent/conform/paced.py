@@ -70,7 +70,6 @@ class _Clock:
     def __init__(self, trial: Trial, *, first: int) -> None:
         self.trial, self.play, self.node, self.first = trial, trial.play, trial.node, first
         self.given: set[Lacked] = set()  # what was sent, of messages
-        self.early: set[Lacked] = set()  # before its tick
         self.lacked: list[Lacked] = []
         self.counts: Counter[str] = Counter()
         self.before: Estimate | None = None  # what it told of the step before; None where that had no tick
@@ -97,7 +96,10 @@ class _Clock:
             for topic, step in late:
                 self.trial.give_estimate(topic.split("/")[1], step)
             late = [lacked for lacked in withheld if fate is Fate.HEARD_LATE]
-        self._audit(self._account())
+        account = self._account()
+        self._refuse_silence()
+        self._audit(account)
+        self._refuse_idleness()
         self.trial.end("close")
         used = self.counts["pairs"] - sum(lacked.topic != measurement(self.node) for lacked in self.lacked)
         return f"{self.counts['steps']} estimates, {used} of {self.counts['pairs']} pairs used"
@@ -197,20 +199,17 @@ class _Clock:
         return {name: self.play.estimates[name][k] for name in said - {self.node}}
 
     # What it says of all.
+    def _refuse_silence(self) -> None:
+        """Every substitution has a reason."""
+        events = [event for event in self.trial.told if isinstance(event, Event)]
+        told = {Lacked(event.about, step) for event in events for step in event.steps}
+        for topic, step in self.lacked:
+            if (topic, step) not in told:
+                raise Difference(f"no event of it says why {topic} of step {step} was substituted", step, "event")
+
     def _audit(self, account: Account) -> None:
-        """Every substitution has a reason, most of what was there was used, and the account is that of the run."""
-        told = {
-            Lacked(event.about, step)
-            for event in self.trial.told
-            if isinstance(event, Event)
-            for step in event.steps
-        }  # fmt: skip
-        for lacked in self.lacked:
-            if lacked not in told:
-                raise Difference(f"no event of it says why {lacked.topic} of step {lacked.step} was substituted",
-                                 lacked.step, "event")  # fmt: skip
-        own = measurement(self.node)
-        pairs = sum(lacked.topic != own for lacked in self.lacked)
+        """The account is that of the run."""
+        pairs = sum(lacked.topic != measurement(self.node) for lacked in self.lacked)
         untold = sum(len(self._wanted(k)) for k in range(self.first, self.play.steps) if self._is_untold(k))
         for field, least, most in (
             ("steps", self.counts["steps"], self.counts["steps"]),
@@ -221,11 +220,14 @@ class _Clock:
             value = getattr(account, field)
             if not least <= value <= most:
                 raise _said(account.step, f"account.{field}", value, least, "")
-        early = [lacked for lacked in self.given if FATES[lacked.step] is Fate.EARLY and self._counts(lacked)]
-        late = len(set(early) & set(self.lacked))
-        if late > MOST * len(early):
-            raise Difference(f"it substituted {late} of {len(early)} messages that were there before their tick",
-                             field="heard")  # fmt: skip
+
+    def _refuse_idleness(self) -> None:
+        """Most of what was there was used."""
+        early = {lacked for lacked in self.given if FATES[lacked.step] is Fate.EARLY and self._counts(lacked)}
+        idle = len(early & set(self.lacked))
+        if idle > MOST * len(early):
+            says = f"it substituted {idle} of {len(early)} messages that were there before their tick"
+            raise Difference(says, field="heard")
 
     def _is_untold(self, k: int) -> bool:
         """Whether no estimate tells what became of the pairs of a step: none was made of them, or it was given up."""

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from agent.conform.judge import Difference
-from agent.conform.lockstep import deserted, interrupted, later, namesake, stopped, whole
+from agent.conform.lockstep import deserted, interrupted, later, namesake, stopped
 from agent.conform.paced import FATES, joined_late, paced
 from agent.conform.trial import Setting
 
@@ -24,7 +24,6 @@ MORE: dict[str, tuple[str, Try]] = {
     "paced": ("against the clock, with faults", paced),
     "again": ("against the clock, begun in the middle", joined_late),
 }
-WHOLE = whole
 
 
 @dataclass(frozen=True)

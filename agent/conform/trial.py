@@ -16,6 +16,7 @@ from agent.conform.program import Running
 from agent.conform.stage import Came, Ended, Garbled, Gone, Heard, Stage
 from agent.contract.keys import COORDINATOR, MODE, PLANT, RECORDER, estimate, measurement, node_who, participants
 from agent.contract.messages import Acknowledged, Control, Joining, Leaving, Message, Ready
+from agent.guard import Guard, Unfit
 from agent.guests import programs
 from agent.network.acquaintance import refuse_version
 from agent.network.words import Replayed, Sample
@@ -54,9 +55,11 @@ class Trial:
         self.told: list[Message] = []  # the same, read
         self.ready: list[Ready] = []
         self.joined: Joining | None = None
-        self.left: Leaving | None = None
         self.answers: list[Sample] = []
         self._asked = False
+        self._guard = Guard()  # as others have one
+        self._guard.know(self.play.gains.problem)
+        self._guard.begin(steps=self.play.steps, external=(), paced=period > 0.0)
         self.judge: Judge | None = None
         self._may_end = False
         told = {"run": RUN, "address": self.stage.address, "gains": str(setting.gains.resolve())}
@@ -96,6 +99,7 @@ class Trial:
                 if self.session:
                     raise Difference(f'it shows a second token, "{session}"', field="session")
                 self.session = session
+                self._guard.came(self.who, session)
                 self.judge = Judge(self.own, session=session, first=self._first, tolerance=self.setting.tolerance)
             case Gone() if not self._may_end:
                 while not isinstance(end := self.stage.next(self.setting.deadline), Ended):
@@ -108,13 +112,23 @@ class Trial:
                 self._heed_word(heard)
             case Replayed():
                 self._asked = False
-            case Sample(topic=topic, payload=payload, stamp=stamp, flaw=flaw) if not self._asked:
-                if self.judge is None:
-                    raise Difference(f"it published on {topic} before it had shown a token")
-                self.sent.append(heard)
-                self.told.append(self.judge.read(topic, payload, stamp, flaw=flaw))
+            case Sample() if not self._asked:
+                self._read(heard)
             case Sample():
                 self.answers.append(heard)
+
+    def _read(self, sample: Sample) -> None:
+        topic, payload, stamp = sample.topic, sample.payload, sample.stamp
+        if self.judge is None:
+            raise Difference(f"it published on {topic} before it had shown a token")
+        message = self.judge.read(topic, payload, stamp, flaw=sample.flaw)
+        if topic != estimate(self.node):  # of an estimate every field is compared
+            try:
+                self._guard.admit(topic, payload, stamp)
+            except Unfit as unfit:
+                raise Difference(f"others refuse its message on {topic}: it is {unfit.kind}", message.step) from None
+        self.sent.append(sample)
+        self.told.append(message)
 
     def _heed_word(self, word: Joining | Ready | Leaving) -> None:
         kind = type(word).__name__.lower()
@@ -127,8 +141,6 @@ class Trial:
                 self.joined = word
             case Ready():
                 self.ready.append(word)
-            case Leaving():
-                self.left = word
 
     def _last_words(self) -> str:
         said = self.program.last_words()

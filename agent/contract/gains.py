@@ -33,6 +33,21 @@ class Solver(Model):
     seconds: float
 
 
+class BoxClaim(Model):
+    """What is said of every model in the box that the problem has: its `uncertainty`, and every `tolerance`.
+
+    `ends`, `rows` and `signs` say which corner the worst model is that was found (`designer.box.extent.truth_at`); a
+    proof takes its weights from there, and believes none of it.
+    """
+
+    gamma: Number | None = Field(default=None, gt=1e-150, lt=1e150)  # None: none is proved, and that is why:
+    why_not: str | None = None
+    found: Number | None = None  # the exact gain of the worst model that was found; None: it is not stable
+    ends: tuple[bool, ...]
+    rows: tuple[int, ...]
+    signs: tuple[int, ...]
+
+
 class Certificate(Model):
     """What is proved: sup_k E ||z_tilde(k)||^2 <= gamma^2 sum_k ||w(k)||^2, from zero initial error.
 
@@ -55,6 +70,7 @@ class Certificate(Model):
     lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
     floor: Number | None = None
+    box: BoxClaim | None = None  # where the problem says how far its numbers may be off
     holds: bool = Field(strict=True)
     verified: str  # what was verified, and how
     margins: dict[str, Number]  # by how much each inequality holds; all positive where it does
@@ -63,6 +79,11 @@ class Certificate(Model):
     def by_theorem1(self) -> float | None:
         """The gamma that (17) and (18) prove, for a P that is stored."""
         return self.gamma if self.kind == "lyapunov" else self.theorem1_gamma
+
+    @property
+    def box_gamma(self) -> float | None:
+        """What is claimed for every model of the problem's box."""
+        return None if self.box is None else self.box.gamma
 
     @model_validator(mode="after")
     def _check_claims(self) -> Self:

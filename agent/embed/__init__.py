@@ -15,6 +15,7 @@ from agent.contract.files import refuse_overwrite, write_whole
 from agent.contract.gains import Gains
 from agent.embed import selftest, source
 from agent.embed.names import names_of
+from agent.embed.network import network_header
 from agent.embed.vectors import Vector, answered, made, recorded
 
 STEPS = 200  # that a self-test has, where nothing else is asked for
@@ -30,7 +31,7 @@ def export(
     steps: int = STEPS,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Write a header, a source and a self-test of the node into `folder`.
+    """Write a header, a source and a self-test of the node into `folder`, and what a program in a run needs to know.
 
     The self-test has the first `steps` of `recording`, or made ones of the agent's own filter. In `single` precision a
     recording gives what the node is told, and the agent's filter in float32 what it must answer. Returns the facts.
@@ -46,6 +47,7 @@ def export(
         f"{names.node}_selftest.c": selftest.program(
             gains, names, own, vectors, dtype, is_recorded=recording is not None
         ),
+        f"{names.node}_run.h": network_header(gains, names, own, dtype),
     }
     _write(folder, texts, force=force)
     return {

@@ -22,7 +22,7 @@ from agent.contract.gains import NodeGains
 from agent.contract.keys import estimate, measurement, node_who
 from agent.contract.messages import ZERO_STATE, Account, Estimate, Event, Measurement, Message, Mode, Way
 from agent.estimates import told
-from agent.filter import Pair, innovation, step
+from agent.filter import Pair, Step, innovation, step
 from agent.inbox import Inbox
 from agent.pacing.reasons import Reasons
 from agent.pacing.spread import Spread
@@ -56,8 +56,9 @@ class PacedNode:
         lost: Callable[[int], Container[str]],
         is_there: Callable[[str], bool] = lambda topic: True,
         begins: bool = True,
+        filter_step: Step = step,
     ) -> None:
-        self._own, self._pace, self._steps = own, pace, steps
+        self._own, self._pace, self._steps, self._filter_step = own, pace, steps, filter_step
         self._lost, self._is_there = lost, is_there
         self._inbox, self._who = Inbox(own), node_who(own.node)
         self._measurement = measurement(own.node)
@@ -205,7 +206,7 @@ class PacedNode:
         self._inbox.put(own.node, self._sent)
         heard = self._inbox.heard(lost=set(self._inbox.neighbours) - {own.node, *there})
         assert self._inbox.mode is not None
-        self._x_hat = step(own, self._inbox.mode, heard)
+        self._x_hat = self._filter_step(own, self._inbox.mode, heard)
         self._made_by = self._inbox.mode, list(heard)
         self._made += 1
         self._to_step.add(now - self._ticks[k].at)

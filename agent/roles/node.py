@@ -16,7 +16,7 @@ from agent.contract.messages import Account, Control, Estimate, Message, Mode, W
 from agent.contract.schedule import Deliveries
 from agent.estimates import told
 from agent.faults import Arriving, Ordeal, parse
-from agent.filter import Pair, innovation, step
+from agent.filter import Pair, Step, innovation, step
 from agent.inbox import Inbox
 from agent.network.arrivals import Arrivals, way
 from agent.network.bus import Bus
@@ -28,8 +28,8 @@ from agent.roles.joining import take_part
 from agent.roles.suffering import suffer
 
 
-def run(bus: Bus, gains: Gains, *, node: str) -> None:
-    """Take part as node `node` until the run has ended."""
+def run(bus: Bus, gains: Gains, *, node: str, step: Step = step) -> None:
+    """Take part as node `node` until the run has ended; `step` is its filter, where it has one of its own."""
     problem, own = gains.problem, gains.for_node(node)
     i = problem.node_index(node)
     senders = {problem.node_names[j]: j for j in problem.ever_heard(i)}
@@ -46,7 +46,7 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
             return {sender for sender, j in senders.items() if not phi[j]}
 
         if not start.period:
-            _in_lock_step(bus, own, lost, modes, measurements, estimates)
+            _in_lock_step(bus, own, lost, modes, measurements, estimates, step)
             return
         bus.trace()
         sensor = sensor_who(node) if node in start.external else PLANT
@@ -57,6 +57,7 @@ def run(bus: Bus, gains: Gains, *, node: str) -> None:
             lost=lost,
             is_there=lambda topic: (sensor if topic == measurement(node) else _node_of(topic)) in bus.present,
             begins=start.step == 0,
+            filter_step=step,
         )
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         arriving = Arriving(faults, problem, node, seed=start.seed)
@@ -78,6 +79,7 @@ def _in_lock_step(
     modes: Gate,
     measurements: Gate,
     estimates: Mapping[str, Gate],
+    filter_step: Step,
 ) -> None:
     """Step after step, each once everything is there, until a channel closes."""
     inbox, x_hat = Inbox(own), np.zeros(own.M.shape[1])
@@ -94,7 +96,7 @@ def _in_lock_step(
         while (sender := inbox.lacking) is not None:
             _put(inbox, estimates[sender].next())
         mode, pairs = inbox.mode, inbox.heard(lost=lost(k))
-        x_hat, heard = step(own, mode, pairs), list(pairs)
+        x_hat, heard = filter_step(own, mode, pairs), list(pairs)
         inbox.next_step()
         for sender in estimates.keys() - set(heard):  # whose message was not needed must not pile up
             for admitted in estimates[sender].waiting():

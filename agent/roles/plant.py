@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from pydantic import ValidationError
 
@@ -20,16 +22,18 @@ from agent.product import product
 from agent.roles.joining import take_part
 from agent.roles.suffering import suffer
 
+Dynamics = Callable[[Array, Array], Array]  # x(k + 1) of x(k) and w(k)
 
-def run(bus: Bus, gains: Gains) -> None:
-    """Take part as the plant until the run has ended."""
+
+def run(bus: Bus, gains: Gains, *, dynamics: Dynamics | None = None) -> None:
+    """Take part as the plant until the run has ended; `dynamics` stands in place of eq. (1)."""
     problem = gains.problem
     SimulatedPlant(problem, seed=0, worst_case=gains.worst_case)  # where a worst case is lacking, say so before the run
     modes = bus.channel(MODE)
     bus.advertise([PLANT_STATE, *map(measurement, problem.node_names)])
 
     def work(start: Control) -> None:
-        plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case)
+        plant = SimulatedPlant(problem, seed=start.seed, worst_case=gains.worst_case, dynamics=dynamics)
         faults = [parse(text, problem, steps=start.steps) for text in start.faults]
         ordeal = Ordeal(faults, PLANT, begin=start.step, again=bus.is_late)
         if start.period:
@@ -40,7 +44,7 @@ def run(bus: Bus, gains: Gains) -> None:
                 bus.guard.refuse(MODE, UNTIMELY)
                 continue
             if start.period:
-                if step < plant.step:
+                if step < max(plant.step, start.step):
                     continue  # a coordinator that has come back gives out again what the recorder has not got
                 suffer(ordeal.due(step))
                 if plant.step or not start.step:
@@ -61,8 +65,16 @@ def run(bus: Bus, gains: Gains) -> None:
 class SimulatedPlant:
     """x(k) from the initial error, and what every sensor delivers of it."""
 
-    def __init__(self, problem: Problem, *, seed: int, worst_case: Array | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        seed: int,
+        worst_case: Array | None = None,
+        dynamics: Dynamics | None = None,
+    ) -> None:
         self._problem = problem
+        self._dynamics = dynamics if dynamics is not None else self._linear
         self._losses = Losses(problem, seed=seed)
         self._disturbance = DisturbanceSource(problem, seed=seed, worst_case=worst_case)
         self._x = problem.initial_error
@@ -100,9 +112,13 @@ class SimulatedPlant:
             node.name: Measurement(step=step, y=_measured(node, theta_i, x, w).tolist())
             for node, theta_i in zip(self._problem.nodes, theta, strict=True)
         }
-        self._x = product(plant.A, x) + product(plant.B, w)
+        self._x = self._dynamics(x, w)
         self.step += 1
         return state, measurements
+
+    def _linear(self, x: Array, w: Array) -> Array:
+        """Eq. (1), A x + B w."""
+        return product(self._problem.plant.A, x) + product(self._problem.plant.B, w)
 
 
 def _measured(node: Node, theta_i: float, x: Array, w: Array) -> Array:

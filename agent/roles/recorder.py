@@ -146,6 +146,9 @@ class Recorder:
         for sample in self._bus.replayed(self._publishers):
             self._take_replayed(sample)
         self._take_waiting(most=2 * CAPACITY)  # what came meanwhile
+        if self._ordeal is not None:
+            for who in self._publishers:  # what nobody has given went with the process that held it
+                self._record.receipts.close_gap(who)
         self._record.finish(status=status, reason=reason)
         self._heed_failure()
         self._acknowledge(closed=True)

@@ -20,7 +20,8 @@ from agent.contract.errors import Unattainable, counted
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, truth_at
-from designer.box.robust import Robust, problem_at, robust, worst
+from designer.box.robust import Robust, robust
+from designer.box.worst import problem_at, worst
 from designer.gain.exact import Operator, horizon_gain
 from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
@@ -104,6 +105,8 @@ def design_for_box(
         before, search = robust(problem, nominal.K, nominal.H, box), False
     if nominal.method != "exact":
         return ForBox(nominal, before, nominal, before, f"method {nominal.method} does not design for a box")
+    if box.corners == 1:
+        return ForBox(nominal, before, nominal, before, "what may be off A, B, C, D and M is not designed for")
     if not search:
         return ForBox(nominal, before, nominal, before, "interrupted, nothing else was tried")
     descent = _Search(problem, box, nominal, before, Budget() if budget is None else budget, progress)
@@ -148,7 +151,8 @@ class _Search:
         budget: Budget,
         progress: Callable[[Progress], None] | None,
     ) -> None:
-        self.problem, self.box, self.budget, self.progress = problem, box, budget, progress
+        self.problem, self.whole, self.budget, self.progress = problem, box, budget, progress
+        self.box = box._replace(entries=())  # in which the worst are sought: entries have the units of the problem
         self.natural = NaturalUnits(problem)
         self.barrier = Barrier(self.natural.problem, _HORIZON)
         self.longest = longest_horizon(problem)
@@ -213,13 +217,13 @@ class _Search:
     def meet(self, gamma: float, *, most: int) -> bool:
         """Whether there is more to do on this weight: one corner more, up to so many, or a horizon twice as long."""
         problem, gains = self.natural.problem, self.barrier.entries.unpack(self.v)
-        ends, rows, gain = worst(problem, *link_gains(problem, *gains), self.box)
-        corner = tuple(ends), tuple(rows)
+        found = worst(problem, *link_gains(problem, *gains), self.box)
+        corner, gain = (found.ends, found.rows), found.gain
         if corner not in self.met:
             if len(self.met) == most:
                 return False
             self.met.add(corner)
-            truth = problem_at(problem, truth_at(problem, self.box, ends, rows))
+            truth = problem_at(problem, truth_at(problem, self.box, *corner))
             self.barrier.models.append(Inputs(truth, problem.beta))
             return True
         if gain > gamma * (1.0 + _SHORT) and 2 * self.barrier.horizon <= self.longest:
@@ -230,7 +234,7 @@ class _Search:
     def prove(self) -> float:
         """Gamma of v for the box, infinite where none is proved; kept, if it is the least."""
         K, H = self.natural.back(*link_gains(self.natural.problem, *self.barrier.entries.unpack(self.v)))
-        found = robust(self.problem, K, H, self.box)
+        found = robust(self.problem, K, H, self.whole)
         self.is_proved = True
         gamma = math.inf if found.gamma is None else found.gamma
         if gamma < self.least:

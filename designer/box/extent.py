@@ -1,8 +1,8 @@
 """A box of models, as data: how far numbers may be from those of the file, and its corners.
 
-The gains, and the beta_j in filters that do not see their losses, are those of the file. beta and rho may be anywhere
-in an interval, each by itself; a row of Pi anywhere within a total variation. They may change at every step, and
-depend on all that happened before it.
+The gains, and beta_j, C_j and M in the filters, are those of the file. beta and rho may be anywhere in an interval,
+each by itself; a row of Pi anywhere within a total variation; entries of A, B, C, D, M off by up to a radius, each by
+itself. They may change at every step, and depend on all that happened before it.
 """
 
 from __future__ import annotations
@@ -15,17 +15,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted, shortened
 from agent.contract.problem import Problem
+from agent.contract.problem.matrices import Matrices, matrices_of
 from agent.contract.problem.uncertainty import Tolerance, tolerance
 from designer.box.rows import Row, row_corners
 from designer.proof.ball_model import Truth, told
+from designer.proof.deviations import Entry
 
 NAMES = {
     "probabilities": "arrival and delivery probabilities below 1, each +- so much: 0.02, or 2% of the value",
     "transition": "each row of the transition matrix within so much of total variation: 0.05",
+    **{
+        letter: f"each entry of {letter}{' of all nodes' if letter in 'CD' else ''} +- so much: 0.02, or 2% of it"
+        for letter in "ABCDM"
+    },
 }
-MOST_CORNERS = 1024
+MATRICES = ("A", "B", "C", "D", "M")
+MOST_CORNERS, MOST_ENTRIES, MOST_STATES = 1024, 400, 120
 
 
 class Interval(NamedTuple):
@@ -45,6 +53,8 @@ class Box(NamedTuple):
     intervals: tuple[Interval, ...]
     rows: tuple[tuple[Row, ...], ...]  # of each mode: the corners of what the row may be; one, where it is the file's
     extent: str
+    entries: tuple[Entry, ...] = ()
+    carry: bool = False  # x feeds the errors of some model, though not those of the file's
 
     @property
     def corners(self) -> int:
@@ -60,25 +70,26 @@ def within(texts: Sequence[str]) -> dict[str, Tolerance]:
     """`name=size` of every option --within. Raises InputError."""
     found: dict[str, Tolerance] = {}
     for text in texts:
-        name, _, size = text.partition("=")
-        if name not in NAMES:
-            raise InputError(f"--within {shortened(text)}: {shortened(name)} is none of {', '.join(NAMES)}")
-        if name in found:
-            raise InputError(f"--within: {name} is there twice; give it one tolerance")
-        found[name] = _tolerance(text, size, relative=name != "transition")
+        names, _, size = text.partition("=")
+        for name in names.split(","):
+            if name not in NAMES:
+                raise InputError(f"--within {shortened(text)}: {shortened(name)} is none of {', '.join(NAMES)}")
+            if name in found:
+                raise InputError(f"--within: {name} is there twice; give it one tolerance")
+            found[name] = _tolerance(text, size, name)
     return found
 
 
-def _tolerance(text: str, size: str, *, relative: bool) -> Tolerance:
+def _tolerance(text: str, size: str, name: str) -> Tolerance:
+    relative, most = name != "transition", math.inf if name in MATRICES else 1.0
     try:
-        found = tolerance(size if size.endswith("%") else float(size), most=1.0)
+        found = tolerance(size if size.endswith("%") else float(size), most)
     except ValueError:
         found = None
     if found is None or not found.size or (found.relative and not relative):
         like = "0.02 or 2%" if relative else "0.05"
-        raise InputError(
-            f'--within {shortened(text)}: "{size}" is no tolerance; it is above 0 and at most 1, like {like}'
-        )
+        limit = "above 0" if math.isinf(most) else "above 0 and at most 1"
+        raise InputError(f'--within {shortened(text)}: "{size}" is no tolerance; it is {limit}, like {like}')
     return found if found.relative else found._replace(size=Fraction(size))
 
 
@@ -90,6 +101,9 @@ def box_of(problem: Problem, tolerances: Mapping[str, Tolerance]) -> Box:
         raise InputError(f"--within probabilities: {problem.name} has no arrival or delivery probability below 1")
     if "transition" in tolerances and len(problem.topologies) == 1:
         raise InputError(f"--within transition: {problem.name} has one topology, so its transition matrix is certain")
+    for letter in tolerances.keys() & set(MATRICES):
+        if not any(entry.matrix == letter for entry in box.entries):
+            raise InputError(f"--within {letter}: every entry of {letter} is 0, and a part of that is nothing")
     return box
 
 
@@ -99,13 +113,9 @@ def box_in(problem: Problem) -> Box | None:
     Raises InputError where too much may vary.
     """
     said = {} if problem.uncertainty is None else problem.uncertainty.document()
-    for name, parts in (("A, B or M", [problem.plant]), ("C or D", problem.nodes)):
-        own = [part.tolerance.document().keys() - {"arrival_probability"} for part in parts if part.tolerance]
-        if any(own) or said.keys() - {"probabilities", "transition"}:
-            raise InputError(f"{problem.name}: a tolerance of {name} is not proved yet; leave it out")
     general = {name: tolerance(size) for name, size in said.items()}
     box = _Sizes(problem, general, own=True).box("tolerances of the problem file", where="uncertainty")
-    return box if box.corners > 1 else None
+    return box if box.corners > 1 or box.entries else None
 
 
 def _text(size: Tolerance) -> str:
@@ -119,13 +129,26 @@ class _Sizes:
         self.problem, self.general, self.own = problem, general, own
 
     def box(self, extent: str, *, where: str) -> Box:
-        box = Box(tuple(self._intervals()), tuple(self._rows()), extent)
+        box = Box(tuple(self._intervals()), tuple(self._rows()), extent, tuple(self._entries()))
+        box = box._replace(carry=self._carries(box))
         if box.corners > MOST_CORNERS:
             raise InputError(
                 f"{where}: the box has {box.corners} corners, of {counted(len(box.intervals), 'probability')} and "
                 f"rows of the transition matrix; up to {MOST_CORNERS} are looked at"
             )
+        if len(box.entries) > MOST_ENTRIES:
+            raise InputError(f"{where}: the box has {len(box.entries)} entries; up to {MOST_ENTRIES} are looked at")
+        states = (self.problem.n + 1) * self.problem.nx
+        if box.entries and states > MOST_STATES:
+            raise InputError(
+                f"{where}: with entries of matrices up to {MOST_STATES} states of plant and errors are looked at; "
+                f"{self.problem.name} has {states}"
+            )
         return box
+
+    def _carries(self, box: Box) -> bool:
+        hidden = any(part.matrix == "beta" and not self.problem.nodes[part.at[0]].seen for part in box.intervals)
+        return not self.problem.carries_plant and (hidden or any(entry.matrix in "ACM" for entry in box.entries))
 
     def _said(self, part: Any, name: str) -> Any:
         """What the part's own `tolerance` says of it."""
@@ -150,6 +173,28 @@ class _Sizes:
             what, value = f'delivery from "{link.sender}" to "{link.receiver}"', link.delivery_probability
             yield from self._interval(what, "rho", at, value, self._said(link, "delivery_probability"))
 
+    def _entries(self) -> Iterator[Entry]:
+        plant, found = self.problem.plant, matrices_of(self.problem)
+        for letter in ("A", "B", "M"):
+            yield from self._matrix(letter, 0, getattr(found, letter), self._said(plant, letter))
+        for j, node in enumerate(self.problem.nodes):
+            yield from self._matrix("C", j, node.C, self._said(node, "C"))
+            yield from self._matrix("D", j, node.D, self._said(node, "D"))
+
+    def _matrix(self, letter: str, node: int, values: Array, given: Any) -> Iterator[Entry]:
+        general = self.general.get(letter)
+        if given is None and general is None:
+            return
+        for (row, column), value in np.ndenumerate(values):
+            if given is None:
+                assert general is not None
+                size = general
+            else:
+                size = tolerance(given[row][column] if isinstance(given, list) else given)
+            radius = _outwards(Fraction(0), size.of(float(value)))[1]
+            if radius > 0.0:
+                yield Entry(letter, node, row, column, radius)
+
     def _interval(self, what: str, matrix: str, at: tuple[int, ...], value: float, given: Any) -> Iterator[Interval]:
         """A probability of 1 is certain, unless it says itself that it is not."""
         if given is not None:
@@ -173,16 +218,30 @@ def _outwards(low: Fraction, high: Fraction) -> tuple[float, float]:
     )
 
 
-def truth_at(problem: Problem, box: Box, ends: Sequence[bool], rows: Sequence[int]) -> Truth:
-    """The model with these intervals at their upper ends, and these corners of the rows of Pi."""
+def truth_at(problem: Problem, box: Box, ends: Sequence[bool], rows: Sequence[int], signs: Sequence[int] = ()) -> Truth:
+    """The model with these intervals at their upper ends, and these corners of the rows of Pi.
+
+    `signs`: +1, -1 or 0 for each entry, which is so many radii off; without them none is.
+    """
     beta, rho = np.array(problem.beta), np.array(problem.delivery)
     for part, upper in zip(box.intervals, ends, strict=True):
         (beta if part.matrix == "beta" else rho)[part.at] = part.high if upper else part.low
-    return Truth(beta, rho, [list(of_mode[k]) for of_mode, k in zip(box.rows, rows, strict=True)])
+    transition = [list(of_mode[k]) for of_mode, k in zip(box.rows, rows, strict=True)]
+    return Truth(beta, rho, transition, _matrices(problem, box, signs) if signs else None, box.carry)
+
+
+def _matrices(problem: Problem, box: Box, signs: Sequence[int]) -> Matrices:
+    A, B, M, C, D = matrices_of(problem)
+    moved = Matrices(A.copy(), B.copy(), M.copy(), tuple(c.copy() for c in C), tuple(d.copy() for d in D))
+    for entry, sign in zip(box.entries, signs, strict=True):
+        of_letter = getattr(moved, entry.matrix)
+        matrix = of_letter[entry.node] if entry.matrix in "CD" else of_letter
+        matrix[entry.row, entry.column] += sign * entry.radius
+    return moved
 
 
 def corners(problem: Problem, box: Box) -> list[Truth]:
-    """Models of which those of one mode s are all corners of what S(Y)(s) depends on."""
+    """Models of which those of one mode s are all corners of what S(Y)(s) depends on, but for entries of matrices."""
     turns = range(max(len(rows) for rows in box.rows))
     return [
         truth_at(problem, box, ends, [min(turn, len(rows) - 1) for rows in box.rows])

@@ -13,7 +13,7 @@ from agent.commands.options import Subcommands, add_command, load_gains, positiv
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, listed
 
 if TYPE_CHECKING:
-    from agent.conform.series import Try
+    from agent.conform.series import Result, Try
     from agent.contract.gains import Gains
     from designer.conformity import Network
 
@@ -47,6 +47,7 @@ def add_conform(commands: Subcommands) -> None:
     conform.add_argument("--gains", type=Path, metavar="FILE", help="in the network of these gains alone")
     conform.add_argument("--node", metavar="NAME", help="the node of --gains that the program is")
     conform.add_argument("--only", action="append", default=[], metavar="TRIAL", help="this trial; may be repeated")
+    conform.add_argument("--skip", action="append", default=[], metavar="TRIAL", help="not this one; may be repeated")
     conform.add_argument("--list", action="store_true", help="say what the trials are, and try nothing")
     conform.add_argument(
         "--tolerance",
@@ -62,38 +63,17 @@ def add_conform(commands: Subcommands) -> None:
 
 def conform_command(options: argparse.Namespace) -> int:
     """`peakmesh conform -- COMMAND`."""
-    from agent.conform.play import Play
-    from agent.conform.series import SEED, STEPS, Result, tried
-    from agent.conform.trial import Setting
-    from agent.guests import guests
-
     trials = _chosen(options)
     if options.list:
         print("\n".join(f"{trial.name:<8} {trial.what}" for trial in trials))
         return EXIT_GOOD
     if not options.program:
         raise InputError("there is no command to try: peakmesh conform -- ./my_node")
-    first = trials[0].network
-    (words,) = guests(first.gains, nodes={first.node: options.program}, sensors={}, plant=None).values()
     results: list[Result] = []
-    with tempfile.TemporaryDirectory(prefix="peakmesh-") as folder:
-        path = Path(folder) / "gains.json"
-        for trial in trials:
-            gains = trial.network.gains
-            gains.save(path, force=True)
-            setting = Setting(
-                words,
-                path if options.gains is None else options.gains,
-                Play(gains, steps=STEPS, seed=SEED),
-                trial.network.node,
-                wait=options.wait,
-                deadline=options.deadline,
-                end=options.deadline,
-                tolerance=options.tolerance or 0.0,
-            )
-            results.append(tried(trial.name, trial.what, trial.attempt, setting))
-            if not options.json:
-                print(results[-1].text(), flush=True)
+    for result in _results(options, trials):
+        results.append(result)
+        if not options.json:
+            print(result.text(), flush=True)
     failed = sum(not result.passed for result in results)
     if options.json:
         print(json.dumps({"passed": not failed, "trials": [result.document() for result in results]}))
@@ -102,29 +82,61 @@ def conform_command(options: argparse.Namespace) -> int:
     return EXIT_NO if failed else EXIT_GOOD
 
 
+def _results(options: argparse.Namespace, trials: list[_Trial]) -> Iterator[Result]:
+    from agent.conform.play import Play
+    from agent.conform.series import SEED, STEPS, tried
+    from agent.conform.trial import Setting
+    from agent.guests import guests
+
+    first = trials[0].network
+    (command,) = guests(first.gains, nodes={first.node: options.program}, sensors={}, plant=None).values()
+    with tempfile.TemporaryDirectory(prefix="peakmesh-") as folder:
+        for trial in trials:
+            gains, path = trial.network.gains, options.gains
+            if path is None:
+                path = Path(folder) / "gains.json"
+                gains.save(path, force=True)
+            setting = Setting(
+                command,
+                path,
+                Play(gains, steps=STEPS, seed=SEED),
+                trial.network.node,
+                wait=options.wait,
+                deadline=options.deadline,
+                end=options.deadline,
+                tolerance=options.tolerance or 0.0,
+            )
+            yield tried(trial.name, trial.what, trial.attempt, setting)
+
+
 def _chosen(options: argparse.Namespace) -> list[_Trial]:
     trials = list(_trials(options))
     names = [trial.name for trial in trials]
-    for name in options.only:
-        if name not in names:
-            raise InputError(f"--only {name}: there is no such trial; there are {listed(names)}")
-    return [trial for trial in trials if not options.only or trial.name in options.only]
+    for option, chosen in (("--only", options.only), ("--skip", options.skip)):
+        for name in chosen:
+            if name not in names:
+                raise InputError(f"{option} {name}: there is no such trial; there are {listed(names)}")
+    left = [name for name in options.only or names if name not in options.skip]
+    if not left:
+        raise InputError("--skip leaves nothing to try")
+    return [trial for trial in trials if trial.name in left]
 
 
 def _trials(options: argparse.Namespace) -> Iterator[_Trial]:
-    from agent.conform.series import MORE, WHOLE
+    from agent.conform.lockstep import whole
+    from agent.conform.series import MORE
 
     if (options.gains is None) != (options.node is None):
         raise InputError("--gains FILE and --node NAME go together: a network, and the node that the program is in it")
     if options.gains is not None:
         own: _Network | Network = _Network(load_gains(options.gains), options.node)
         own.gains.problem.node_index(own.node)
-        yield _Trial("whole", f"node {own.node} of {own.gains.problem.name}", WHOLE, own)
+        yield _Trial("whole", f"node {own.node} of {own.gains.problem.name}", whole, own)
     else:
         from designer.conformity import NETWORKS
 
         for name, network in NETWORKS.items():
-            yield _Trial(name, network.what, WHOLE, network)
+            yield _Trial(name, network.what, whole, network)
         own = network
     for name, (what, attempt) in MORE.items():
         yield _Trial(name, what, attempt, own)

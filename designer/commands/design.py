@@ -151,6 +151,7 @@ def design_and_save(
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
     from designer.beyond_gamma import beyond_gamma
+    from designer.box.claim import with_claim
     from designer.diagnosis import warnings
     from designer.ladder import ladder_of
     from designer.proof.certificate import stored_P
@@ -170,6 +171,8 @@ def design_and_save(
         how["progress"] = _descent_progress()
         found = None if box is None else design_in_box(problem, box, **how)
         gains = design(problem, **how) if found is None else found.gains
+    if found is not None and not within:  # the box is in the file, and so is what is proved of it
+        gains = with_claim(gains, found.robust)
     if gains.solver.status.startswith("out of time"):
         print(
             f"warning: the search was out of time after {gains.solver.iterations} steps; --budget gives it more",

@@ -22,15 +22,21 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from agent.contract.problem.matrices import Matrices, matrices_of
 from designer.proof.balls import add, exact, identity, part
 
 
 class Truth(NamedTuple):
-    """What happens, where that is not what the filters were told: the gains and the beta_j in them stay as they are."""
+    """What happens, where filters were told something else: the gains, beta_j, C_j and M in them stay as they are.
+
+    `carry`: x is in eta, where it is in that of the file without being asked for.
+    """
 
     beta: Array  # (n,): of arrivals
     rho: Array  # (n, n): of deliveries, from j to i
     transition: list[list[Fraction]]  # Pi; every row sums to 1
+    matrices: Matrices | None = None  # None: those of the file
+    carry: bool = False
 
 
 def told(problem: Problem) -> Truth:
@@ -39,28 +45,39 @@ def told(problem: Problem) -> Truth:
     return Truth(problem.beta, problem.delivery, [[pi / sum(row) for pi in row] for row in rows])
 
 
+Carried = list[tuple[list[int], arb_mat]]  # rows of eta+, and what leads there
+
+
 class Noise(NamedTuple):
-    """One xi_l: its variance, and E_l C_l by the rows of eta+ and columns of [eta; w] where they are not zero."""
+    """One xi_l: its variance, and E_l C_l by the rows of eta+ and columns of [eta; w] where they are not zero.
+
+    `carried` (len(rows), ny_j) says what becomes of the innovation of node `sender`, or of what a `loss` takes from it.
+    """
 
     variance: arb
     rows: list[int]
     E: arb_mat  # (len(rows), r)
     columns: list[int]
     C: arb_mat  # (r, len(columns))
+    sender: int
+    carried: arb_mat
+    loss: bool
 
 
 class Sensor(NamedTuple):
     """What node j measures: its mean innovation bias x + C_mean e_j + D_mean w; a loss takes `lost` [eta; w] from it.
 
-    A node that does not see its losses subtracts c_j C_j x_hat_j, where c_j is the beta_j that it was told.
+    For measurements C~_j x + D~_j w. A node that does not see its losses subtracts c_j C_j x_hat_j, where c_j is the
+    beta_j that it was told.
     """
 
-    bias: arb_mat | None  # (beta_j - c_j) C_j; None where that is 0
+    bias: arb_mat | None  # beta_j C~_j - c_j C_j, or beta_j (C~_j - C_j) where the loss is seen; None where that is 0
     C_mean: arb_mat  # c_j C_j, or beta_j C_j where the loss is seen
-    D_mean: arb_mat  # D_j, or beta_j D_j where the loss is seen
+    D_mean: arb_mat  # D~_j, or beta_j D~_j where the loss is seen
+    beta: arb
     alpha: arb  # beta_j (1 - beta_j)
     columns: list[int]  # of `lost`
-    lost: arb_mat  # C_j over x, or [C_j, D_j] over (e_j, w) where the loss is seen
+    lost: arb_mat  # C~_j over x, or [C_j, D~_j] over (e_j, w) where the loss is seen, with C~_j - C_j over x
 
 
 class BallModel:
@@ -69,7 +86,8 @@ class BallModel:
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
         nx, n = problem.nx, problem.n
         self.truth = truth or told(problem)
-        p = problem.plant_states
+        self.real = self.truth.matrices or matrices_of(problem)
+        p = nx if problem.carries_plant or self.truth.carry else 0
         self.size, self.nw = p + n * nx, problem.nw
         self.x = list(range(p))
         self.e = [list(range(p + i * nx, p + (i + 1) * nx)) for i in range(n)]
@@ -77,17 +95,16 @@ class BallModel:
         self.w = list(range(self.size, self.size + problem.nw))
         self.M = arb_mat(n * problem.nz, self.size)
         for i in range(n):
-            add(
-                self.M,
-                range(i * problem.nz, (i + 1) * problem.nz),
-                self.e[i],
-                exact(problem.plant.M) * arb(float(problem.weights[i])),
-            )
+            rows, weight = range(i * problem.nz, (i + 1) * problem.nz), arb(float(problem.weights[i]))
+            add(self.M, rows, self.e[i], exact(problem.plant.M) * weight)
+            if self.x:
+                add(self.M, rows, self.x, (exact(self.real.M) - exact(problem.plant.M)) * weight)
         self.transition = [[arb(pi.numerator) / arb(pi.denominator) for pi in row] for row in self.truth.transition]
         self.sensors = [self._sensor(problem, j) for j in range(n)]
         self.AB: list[arb_mat] = []  # (n_eta, n_eta + nw), of every mode
         self.filled: list[NDArray[np.bool_]] = []  # where AB may be other than exactly 0
         self.noise: list[list[Noise]] = []
+        self.carried: list[list[Carried]] = []  # of every mode and node j: where its mean innovation goes, and how
         for s in range(len(problem.topologies)):
             self.AB.append(arb_mat(self.size, self.size + self.nw))
             self.filled.append(np.zeros((self.size, self.size + self.nw), dtype=bool))
@@ -99,26 +116,32 @@ class BallModel:
 
     def _sensor(self, problem: Problem, j: int) -> Sensor:
         node = problem.nodes[j]
-        C, D, beta, c = exact(node.C), exact(node.D), arb(self.truth.beta[j].item()), arb(node.arrival_probability)
-        if beta != c and not node.seen and not self.x:
-            raise ValueError(f'node "{node.name}" loses what it does not see: its errors contain x, which is left out')
-        columns, lost = self.x, C
+        C, real, D = exact(node.C), exact(self.real.C[j]), exact(self.real.D[j])
+        beta, c = arb(self.truth.beta[j].item()), arb(node.arrival_probability)
+        by_x = (real - C) * beta if node.seen else real * beta - C * c
+        if not self.x and not _is_zero(by_x):
+            raise ValueError(f'node "{node.name}" measures x, or loses it unseen, as its filter does not know')
+        columns, lost = self.x, real
         if node.seen:
-            ny = C.nrows()
-            columns, lost = self.e[j] + self.w, arb_mat(ny, problem.nx + problem.nw)
-            add(lost, range(ny), range(problem.nx), C)
-            add(lost, range(ny), range(problem.nx, problem.nx + problem.nw), D)
-        bias, by_D = (None, D * beta) if node.seen else (C * (beta - c) if beta != c else None, D)
-        return Sensor(bias, C * (beta if node.seen else c), by_D, beta * (1 - beta), columns, lost)
+            ny, nx = C.nrows(), problem.nx
+            columns, lost = self.e[j] + self.w, arb_mat(ny, nx + problem.nw)
+            add(lost, range(ny), range(nx), C)
+            add(lost, range(ny), range(nx, nx + problem.nw), D)
+            if not _is_zero(real - C):
+                columns, lost = self.x + columns, _beside(real - C, lost)
+        bias = None if _is_zero(by_x) else by_x
+        by_e, by_w = C * (beta if node.seen else c), D * beta if node.seen else D
+        return Sensor(bias, by_e, by_w, beta, beta * (1 - beta), columns, lost)
 
     def _mode(self, problem: Problem, s: int, K: LinkMatrices, H: LinkMatrices) -> list[Noise]:
         """Fill in [A B] of mode s; its noise. K and H have the weights a_ij within from here on."""
-        A, B, nx = exact(problem.plant.A), exact(problem.plant.B), problem.nx
+        A, B, nx = exact(problem.plant.A), exact(self.real.B), problem.nx
         topology, names, heard = problem.topologies[s], problem.node_names, problem.neighbours
-        noise = []
-        carried: list[list[tuple[list[int], arb_mat]]] = [[] for _ in names]  # of j: where its innovation goes, and how
+        noise, real_A = [], exact(self.real.A)
+        carried: list[Carried] = [[] for _ in names]
+        self.carried.append(carried)
         if self.x:
-            self._add(s, self.x, self.x, A)
+            self._add(s, self.x, self.x, real_A)
             self._add(s, self.x, self.w, B)
         for i, receiver in enumerate(names):
             weights = {j: arb(topology.adjacency[i, j].item()) for j in heard(s, i)}
@@ -127,8 +150,10 @@ class BallModel:
             others = sum((K_i[j] for j in K_i if j != i), arb_mat(nx, nx))
             if problem.unbiased:
                 K_i[i] = A - others  # what the node steps by; the file has it rounded
+                if not _is_zero(real_A - A):
+                    self._add(s, self.e[i], self.x, real_A - A)
             elif self.x:
-                self._add(s, self.e[i], self.x, A - others - K_i[i])
+                self._add(s, self.e[i], self.x, real_A - others - K_i[i])
             self._add(s, self.e[i], self.w, B)
             for j in weights:
                 sensor, rho = self.sensors[j], arb(self.truth.rho[i, j].item())
@@ -144,22 +169,25 @@ class BallModel:
                 self._add(s, self.e[i], self.e[i], K_i[j] * (1 - rho))
                 lossy = rho * (1 - rho)
                 parts = [(self.e[i], -K_i[j]), (self.e[j], by_e), (self.w, by_w), (self.x, by_x)]
-                noise.append(self._of_link(i, lossy, parts))
+                noise.append(self._of_link(i, j, lossy, parts, -H_i[j]))
                 if sensor.alpha > 0:
-                    noise.append(Noise(lossy * sensor.alpha, self.e[i], -H_i[j], sensor.columns, sensor.lost))
+                    taken = sensor.columns, sensor.lost
+                    noise.append(Noise(lossy * sensor.alpha, self.e[i], -H_i[j], *taken, j, -H_i[j], loss=True))
         noise += [self._of_sensor(j, carried[j]) for j in range(problem.n) if self.sensors[j].alpha > 0]
         return noise
 
-    def _of_link(self, i: int, variance: arb, parts: list[tuple[list[int], arb_mat | None]]) -> Noise:
+    def _of_link(
+        self, i: int, j: int, variance: arb, parts: list[tuple[list[int], arb_mat | None]], carried: arb_mat
+    ) -> Noise:
         """A message that arrives: K_ij (e_j - e_i) less H_ij times node j's mean innovation, in e_i."""
         nx, columns = len(self.e[i]), [at for at, block in parts if block is not None]
         C, first = arb_mat(nx, sum(map(len, columns))), 0
         for block in (block for _, block in parts if block is not None):
             add(C, range(nx), range(first, first + block.ncols()), block)
             first += block.ncols()
-        return Noise(variance, self.e[i], identity(nx), [k for at in columns for k in at], C)
+        return Noise(variance, self.e[i], identity(nx), [k for at in columns for k in at], C, j, carried, loss=False)
 
-    def _of_sensor(self, j: int, carried: list[tuple[list[int], arb_mat]]) -> Noise:
+    def _of_sensor(self, j: int, carried: Carried) -> Noise:
         """A measurement that arrives: what a loss takes, in the errors of all who hear node j."""
         sensor = self.sensors[j]
         ny = sensor.lost.nrows()
@@ -168,7 +196,7 @@ class BallModel:
         for k, (part_rows, block) in enumerate(carried):
             first = k * len(part_rows)
             add(E, range(first, first + len(part_rows)), range(ny), block)
-        return Noise(sensor.alpha, rows, E, sensor.columns, sensor.lost)
+        return Noise(sensor.alpha, rows, E, sensor.columns, sensor.lost, j, E, loss=True)
 
     @property
     def modes(self) -> range:
@@ -177,6 +205,8 @@ class BallModel:
     @property
     def MM(self) -> arb_mat:
         """M'M: what |z_tilde|^2 is of eta, (n_eta, n_eta)."""
+        if self.x and not _is_zero(part(self.M, range(self.M.nrows()), self.x)):
+            return self.M.transpose() * self.M
         MM, nz = arb_mat(self.size, self.size), self.M.nrows() // len(self.e)
         for i, e_i in enumerate(self.e):
             M_i = part(self.M, range(i * nz, (i + 1) * nz), e_i)
@@ -210,3 +240,15 @@ class BallModel:
             AB_rows = part(AB, rows, columns)
             add(S, columns, columns, AB_rows.transpose() * (part(Y_bar, rows, rows) * AB_rows))
         return S
+
+
+def _is_zero(matrix: arb_mat) -> bool:
+    return all(entry.is_zero() for entry in matrix.entries())
+
+
+def _beside(left: arb_mat, right: arb_mat) -> arb_mat:
+    """[left right]."""
+    whole, rows = arb_mat(left.nrows(), left.ncols() + right.ncols()), range(left.nrows())
+    add(whole, rows, range(left.ncols()), left)
+    add(whole, rows, range(left.ncols(), whole.ncols()), right)
+    return whole

@@ -16,7 +16,7 @@ from designer.proof.float64 import Bounded, bounded_below, difference, quotient,
 from designer.proof.float_model import FloatModel
 from designer.proof.machine import fault
 
-_BITS = 128  # of the balls that the numbers are taken from
+BITS = 128  # of the balls that the numbers are taken from
 
 
 class ByFloats:
@@ -24,20 +24,39 @@ class ByFloats:
 
     name = f"float64 with a bound on every rounding (numpy {np.__version__})"
     cost = 1.0
+    spreads = False  # about one model, of which S(Y) is linear in Y
 
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
-        with ctx.workprec(_BITS):
-            self.model = FloatModel(BallModel(problem, K, H, truth))
+        with ctx.workprec(BITS):
+            self._begin(BallModel(problem, K, H, truth))
+
+    def _begin(self, balls: BallModel) -> None:
+        self.model = FloatModel(balls)
         self.order = self.model.size
         wrong = fault(self.model.order)
         if wrong is not None:
             self.model.in_range = False  # nothing is decided
             self.name = f"float64, which is not used on this machine because {wrong},"
 
-    @np.errstate(all="ignore")  # what is not finite decides nothing
+    def joint(self, Y: Array, X: Array) -> Bounded | None:
+        """S(Y) of every model that this is about; X, which weighs what is lost by that, loses nothing of one."""
+        return self.model.joint(Y)
+
+    def weigh(self, Y: Array, X: Array) -> Array:
+        """The middle of that."""
+        return self.model.weigh(Y)
+
+    def ended(self, X: Array) -> Array:
+        """Floats above M'M of every model that this is about, (modes, n_eta, n_eta)."""
+        return self.start(up=True)
+
     def inequality_17(self, P: Array) -> list[Sign]:
+        return self.inequality_17_of(P, self.model.joint(symmetric(P)))
+
+    @np.errstate(all="ignore")  # what is not finite decides nothing
+    def inequality_17_of(self, P: Array, S: Bounded | None) -> list[Sign]:
+        """With this for S(P)."""
         P, n = symmetric(P), self.model.size
-        S = self.model.joint(P)
         if S is None:
             return self._undecided
         whole = np.tile(np.eye(self.model.order), (self.model.modes, 1, 1))

@@ -8,7 +8,7 @@ step takes such a Z, which weights help to find and floats with bounds prove.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from agent.contract.arrays import Array
 from designer.proof.balls import UNDECIDED, Sign, of_blocks
 from designer.proof.by_floats import ByFloats, square
 from designer.proof.findings import Verdict, failure, found, margins, proved
-from designer.proof.float64 import Bounded, bounded_below, difference, quotient, raised, sign, weights
-from designer.proof.recursion import recursion
+from designer.proof.float64 import Bounded, bounded_below, difference, quotient, raised, sign, symmetric, weights
+from designer.proof.recursion import Arithmetic, recursion
 
 _ABOVE = 1e-10  # of its own size Z stands above what floats find: more than they err by
 _OUTWEIGHS = 4.0  # times what S(Y) may be off by in floats, Z stands above that too
@@ -28,20 +28,27 @@ class Reached(NamedTuple):
     """Y after so many steps from the last."""
 
     steps: int
-    Y: Array
+    Y: Any
 
 
 class ByVertices:
-    """`designer.proof.recursion.Arithmetic`, of all models with these corners. weights (T, modes, order, order) > 0."""
+    """`designer.proof.recursion.Arithmetic`, of all models with these corners. weights (T, modes, order, order) > 0.
 
-    def __init__(self, corners: Sequence[ByFloats], weights: Array) -> None:
+    Each corner may itself be above many models (`designer.proof.cube`). `mean` (modes, order, order): the weight where
+    something is said of P; without it the mean of all weights.
+    """
+
+    def __init__(self, corners: Sequence[ByFloats], weights: Array, mean: Array | None = None) -> None:
         self.corners, self.weights, first = corners, weights, corners[0]
+        self.mean = np.asarray(weights.mean(axis=0)) if mean is None else mean
         self.order, self.cost = first.order, 3.0 * len(corners)
         self.name = f"{first.name}, at {len(corners)} corners"
 
     def inequality_17(self, P: Array) -> list[Sign]:
-        signs = [corner.inequality_17(P) for corner in self.corners]
-        return [of_blocks(list(of_mode)) for of_mode in zip(*signs, strict=True)]
+        """Not refuted: what is false of something above all models may be true of each."""
+        P = symmetric(P)
+        signs = [corner.inequality_17_of(P, corner.joint(P, self.mean)) for corner in self.corners]
+        return [of_blocks(list(of_mode))._replace(refuted=False) for of_mode in zip(*signs, strict=True)]
 
     def inequality_18(self, P: Array, gamma: float) -> list[Sign]:
         return self.corners[0].inequality_18(P, gamma)
@@ -54,7 +61,8 @@ class ByVertices:
         return [of_blocks(list(of_mode)) for of_mode in zip(*signs, strict=True)]
 
     def start(self, *, up: bool) -> Reached:
-        return Reached(0, self.corners[0].start(up=up))
+        first = self.corners[0]
+        return Reached(0, first.ended(self.mean) if up else first.start(up=False))
 
     @np.errstate(all="ignore")  # what is not finite decides nothing
     def step(self, Y: Reached, gamma: float, *, up: bool) -> tuple[list[Sign], Reached | None]:
@@ -63,10 +71,10 @@ class ByVertices:
             signs, following = self.corners[0].step(Y.Y, gamma, up=False)
             return signs, None if following is None else Reached(Y.steps + 1, following)
         undecided, n = [UNDECIDED] * len(Y.Y), self.order
-        every = [S for corner in self.corners if (S := corner.model.joint(Y.Y)) is not None]
+        every = [S for corner in self.corners if (S := corner.joint(Y.Y, self.weight(Y.steps))) is not None]
         if len(every) < len(self.corners):
             return undecided, None
-        Z = upper_bound(np.array([S.middle for S in every]), self._weight(Y.steps))
+        Z = upper_bound(np.array([S.middle for S in every]), self.weight(Y.steps))
         i = np.arange(Z.shape[1])
         Z[:, i, i] += _OUTWEIGHS * np.max([S.spread for S in every], axis=0)
         if not (np.isfinite(Z).all() and self._is_above(Z, every)):
@@ -83,7 +91,8 @@ class ByVertices:
         grown = quotient(Z, W, np.array(least))
         return signs, None if grown is None else Reached(Y.steps + 1, raised(grown, up=True))
 
-    def _weight(self, steps: int) -> Array:
+    def weight(self, steps: int) -> Array:
+        """Of the step before which so many were taken."""
         return np.asarray(self.weights[min(steps, len(self.weights) - 1)])
 
     def _is_above(self, Z: Array, every: Sequence[Bounded]) -> bool:
@@ -99,15 +108,15 @@ class ByVertices:
         return self.corners[0].below(Y.Y, P, gamma)
 
     def floats(self, Y: Reached) -> Array:
-        return Y.Y
+        return np.asarray(Y.Y)
 
-    def of(self, Y: Array) -> Array:
+    def of(self, Y: Array, X: Array | None = None) -> Array:
         """The middle of S(Y) at every corner, (corners, modes, order, order)."""
-        return np.array([corner.model.weigh(Y) for corner in self.corners])
+        return np.array([corner.weigh(Y, self.mean if X is None else X) for corner in self.corners])
 
     def upper(self, Y: Array, steps: int) -> Array:
         """About what a step takes for Z: not proved."""
-        return upper_bound(self.of(Y), self._weight(steps))
+        return upper_bound(self.of(Y, self.weight(steps)), self.weight(steps))
 
 
 def upper_bound(S: Array, X: Array) -> Array:
@@ -132,7 +141,7 @@ def upper_bound(S: Array, X: Array) -> Array:
     return np.asarray(Z)
 
 
-def prove(by: ByVertices, modes: tuple[str, ...], gamma: float, P: Array) -> Verdict:
+def prove(by: Arithmetic, modes: tuple[str, ...], gamma: float, P: Array) -> Verdict:
     """(17) and P > 0 at every corner, and the recursion: gamma bounds the gain of every model of the box."""
     findings = found("(17)", modes, by.inequality_17(P)) + found("P > 0", modes, by.positive(P))
     if proved(findings):

@@ -30,6 +30,7 @@ from agent.contract.problem import Problem
 from designer.ledger.account import Account
 from designer.ledger.deviation import Deviation
 from designer.replay import free_run, proofs
+from designer.replay.census import Place
 from designer.replay.central import Central
 from designer.replay.coupling import Coupling, with_the_plant
 from designer.replay.gamma import checked_gamma
@@ -103,13 +104,22 @@ def replay(
 
 
 def judge(log: Log, trace: Trace | None = None, *, part: Part | None = None, report: Report | None = None) -> Verdict:
-    """Judge what was read; `trace`, of as many steps, gets what was found at each of them."""
+    """Judge what was read; `trace`, of as many steps, gets what was found at each of them.
+
+    Estimates that others have used may have gone with the process that held them. The model knows them where they were
+    made as the seed says; where that does not explain the rest, nothing is concluded of them, nor of what depends on
+    them, and that is said.
+    """
     central = Central.of(log.gains)
-    names = log.gains.problem.node_names
-    tally = Tally(tolerance(log.gains.problem, paced=log.is_paced), names, trace, part, log.grown)
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
-        compared = _compare(log, central, tally, report or (lambda what, done, of: None))
-    return _verdict(log, tally, compared)
+
+    def compared(trace: Trace | None, *, doubts: bool) -> tuple[Tally, _Compared]:
+        names = log.gains.problem.node_names
+        tally = Tally(tolerance(log.gains.problem, paced=log.is_paced), names, trace, part, log.grown)
+        with np.errstate(over="ignore", invalid="ignore"):  # an unstable free run may: proof 2 still judges
+            return tally, _compare(log, central, tally, report or (lambda what, done, of: None), doubts=doubts)
+
+    doubts = (log.is_part or bool(log.absences.perhaps_sent.any())) and _diverges(*compared(None, doubts=False))
+    return _verdict(log, *compared(trace, doubts=doubts))
 
 
 def ledger(path: FilePath | Sequence[FilePath]) -> Account | None:
@@ -243,10 +253,15 @@ class _Compared(NamedTuple):
     energy: float | None  # and sum of |w|^2
     pacing: Pacing | None
     faults: Mapping[int, Deviation]  # by step
+    unknown: tuple[Place, ...] = ()  # estimates of which nothing is concluded
 
 
-def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compared:
-    """All checks, a block of steps at a time."""
+def _diverges(tally: Tally, compared: _Compared) -> bool:
+    return tally.first is not None or not (compared.audit is None or compared.audit.holds)
+
+
+def _compare(log: Log, central: Central, tally: Tally, report: Report, *, doubts: bool = False) -> _Compared:
+    """All checks, a block of steps at a time; with `doubts`, nothing is concluded of what nobody has recorded."""
     drawn = draw(log, central)
     inputs = logged_inputs(log, central, drawn)
     hears = proofs.to_be_heard(log, central, drawn)
@@ -255,6 +270,7 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compa
     if log.is_paced:
         log = with_the_plant(log, drawn)
         coupling = Coupling.of(log, central, inputs, drawn, hears)
+        coupling = coupling.doubtful() if doubts else coupling
         pacing, faults = Pacing.of(coupling, hears, log.period), faults_of(coupling, hears)
         central, hears = coupling.central, coupling.hears
     tally.add(proofs.start_checks(log, central))
@@ -268,6 +284,7 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compa
             tally.add(coupling.step_checks(now))
         tally.add(proofs.message_checks(log, central, hears, now))
         report("comparing, first pass", now.stop, log.steps)
+    unknown = coupling.unknown_places() if coupling is not None else ()
     whole = coupling.inputs if coupling is not None else free_run.complete(inputs, drawn, log, central)
     energies = (whole.w**2).sum(axis=1)
     energy_before = np.cumsum(energies) - energies
@@ -286,8 +303,8 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report) -> _Compa
             if tally.trace is not None:
                 tally.trace.path_bound[path.first : path.first + len(path.bound)] = path.bound
     if not log.has_plant:
-        return _Compared(None, None, pacing, faults)
-    return _Compared(audit, float(energies.sum()), pacing, faults)
+        return _Compared(None, None, pacing, faults, unknown)
+    return _Compared(audit, float(energies.sum()), pacing, faults, unknown)
 
 
 def _peak(log: Log) -> Peak | None:
@@ -314,10 +331,12 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         is_doubtful=log.is_doubtful,
         notes=log.notes,
         finished=log.finished,
-        whole=log.is_whole,
+        whole=log.is_whole and not compared.unknown,
+        lost=int(log.absences.lost.sum()),
+        unknown=compared.unknown,
         is_simulated=log.is_simulated,
         external=tuple(name for name, real in zip(log.gains.problem.node_names, log.external, strict=True) if real),
-        proofs=tuple(_proofs(log, tally, audit)),
+        proofs=tuple(_proofs(log, tally, audit, compared.unknown)),
         worst_gap=max(tally.gaps.values()),
         worst=tally.worst,
         tolerance=tally.tolerance,
@@ -342,11 +361,11 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
     )
 
 
-def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
+def _proofs(log: Log, tally: Tally, audit: PathAudit | None, unknown: tuple[Place, ...]) -> Iterator[Proof]:
     for number, gap in tally.gaps.items():
         compared = tally.compared[number]
         yield Proof(number, gap <= tally.tolerance if compared else None, compared, gap)
-    yield _census_proof(log)
+    yield _census_proof(log, is_whole=log.is_whole and not unknown)
     if audit is not None and tally.part.node is not None:
         yield Proof(5, None, 0, 0.0, "it is about all nodes together")
     elif audit is not None:
@@ -357,7 +376,7 @@ def _proofs(log: Log, tally: Tally, audit: PathAudit | None) -> Iterator[Proof]:
         yield Proof(5, None, 0, 0.0, "without a plant the error is not known")
 
 
-def _census_proof(log: Log) -> Proof:
+def _census_proof(log: Log, *, is_whole: bool) -> Proof:
     """What a filtered or cut file lacks is held against it no more than it shows anything."""
     census = log.census
     altered = log.evidence.total
@@ -368,5 +387,7 @@ def _census_proof(log: Log) -> Proof:
     if census.lacking.total:
         steps = f" from step {census.lacking.first[0].step} on" if census.lacking.first else ""
         counts.append(f"{census.lacking.total} not in this file{steps}")
-    holds = False if faulty else True if log.is_whole else None
+    if lost := int(log.absences.lost.sum()):
+        counts.append(f"{lost} lost with the process that held them")
+    holds = False if faulty else True if is_whole else None
     return Proof(4, holds, log.messages, 0.0, ", ".join(counts))

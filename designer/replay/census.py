@@ -87,7 +87,7 @@ class Facts:
     recorded: dict[str, int]  # messages of each sender by the word of the recorder; empty where it is not known
     unplanned: frozenset[str]  # topics that the run need not have
     void: Mapping[str, Sequence[range]] = field(default_factory=dict)  # of each sender, numbers that nobody looks for
-    excused: Flags | None = None  # (steps, topics): what nobody was there to send, in a paced run
+    excused: Flags | None = None  # (steps, topics): what was lost, or nobody was there to send, in a paced run
 
 
 class Holes(NamedTuple):

@@ -14,8 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.keys import estimate
 from designer.replay import free_run
 from designer.replay.acting import Acting, with_plant, without_plant
+from designer.replay.census import Place
 from designer.replay.central import FLOOR, Central, Flags
 from designer.replay.free_run import FreeBlock
 from designer.replay.inputs import Drawn, Inputs, logged_plant, logged_states
@@ -35,6 +37,7 @@ class Coupling:
     measured: Array  # (steps, n): mu
     hears: Numbers  # (steps, n): positions in `log.senders` of those that each node should have used
     unexplained: tuple[tuple[int, int], ...]  # (step, node): no event says why, for its process was killed
+    unknown: Flags  # (steps, n): estimates of which nothing is concluded; used by others, and not recorded
 
     @classmethod
     def of(cls, log: Log, central: Central, inputs: Inputs, drawn: Drawn, hears: Numbers) -> Coupling:
@@ -48,7 +51,47 @@ class Coupling:
         used = used | np.eye(log.gains.problem.n, dtype=bool)  # a node always hears itself
         seen = np.array([node.seen for node in log.gains.problem.nodes])
         lost = (log.told == 0) | (seen & (log.measured == 0.0))
-        return cls(log, central, whole, used, np.where(lost, 0.0, 1.0), hears, tuple(sorted(unexplained)))
+        measured, unknown = np.where(lost, 0.0, 1.0), np.zeros(log.told.shape, dtype=bool)
+        return cls(log, central, whole, used, measured, hears, tuple(sorted(unexplained)), unknown)
+
+    def doubtful(self) -> Coupling:
+        """The same, but nothing is concluded of estimates that others have used and that are not recorded.
+
+        What they were made of went with them, so that the model may have another idea of them.
+        """
+        log, n = self.log, self.log.gains.problem.n
+        members = np.vstack([log.senders.members(), np.zeros((1, n), dtype=bool)])
+        told = np.vstack([np.where(log.origin[1:] == -1, log.heard[1:], -1), np.full((1, n), -1)])
+        has_used = members[told].any(axis=1)  # (steps, n): by any node
+        for step, i in np.argwhere((log.origin >= 0) & (log.origin < n)).tolist():
+            has_used[step, log.origin[step, i]] = True
+        return replace(self, unknown=self._perhaps_sent() & has_used)
+
+    def _perhaps_sent(self) -> Flags:
+        """(steps, n): estimates that others may have had; of a part of a recording, all that no absence explains."""
+        log, estimates = self.log, 2 + 2 * np.arange(self.log.gains.problem.n)
+        left_out = self.absent() & ~log.absences.excused[: log.steps, estimates] & log.is_part
+        return np.asarray(log.absences.perhaps_sent[: log.steps] | left_out)
+
+    def unknown_places(self) -> tuple[Place, ...]:
+        """By step."""
+        names = self.log.gains.problem.node_names
+        return tuple(Place(estimate(names[i]), step) for step, i in np.argwhere(self.unknown).tolist())
+
+    @cached_property
+    def anchored(self) -> Flags:
+        """(steps, n): estimates that depend on unknown ones; the model goes on from what is recorded of them."""
+        log, n = self.log, self.log.gains.problem.n
+        anchored, absent = np.zeros_like(self.unknown), self.absent()
+        unknown = np.zeros(n, dtype=bool)  # of the step before
+        for k in range(log.steps if self.unknown.any() else 0):
+            depends = (self.used[k - 1] & unknown).any(axis=1) if k else unknown
+            unknown = self.unknown[k] | (absent[k] & depends)
+            origin = log.origin[k]
+            begins = (origin != -1) & ~absent[k]
+            from_unknown = begins & (origin < n) & unknown[np.clip(origin, 0, n - 1)]
+            anchored[k] = (depends & ~begins & ~absent[k]) | from_unknown
+        return anchored
 
     def absent(self) -> Flags:
         """(steps, n): the node's estimate of the step is not there."""
@@ -138,7 +181,10 @@ class Coupling:
                 step = self.acted(keys[row])
                 if (jump := jumps[row]) is not None:
                     eta = jump @ eta
+                at = p + np.flatnonzero(np.repeat(self.anchored[k], nx))
+                eta[at] = (np.tile(x, central.problem.n) - log.x_hat[k])[at - p]
                 xs[row], etas[row] = x, eta
+                etas[row, at] = np.nan
                 eta = step.A @ eta + step.B @ inputs.w[k]
                 eta[p:] -= step.H @ inputs.u[k]
                 x = eta[:p] if p else x
@@ -164,6 +210,7 @@ class Coupling:
         log, n = self.log, self.log.gains.problem.n
         errors = np.repeat(log.gains.problem.weights, log.gains.problem.nz) * (np.tile(log.z, n) - log.z_hat)
         errors[np.repeat(self.absent(), log.gains.problem.nz, axis=1)] = 0.0
+        errors[np.logical_or.accumulate(self.anchored.any(axis=1))] = np.nan  # whose gain from w is not known
         return np.asarray(np.linalg.norm(errors, axis=1))
 
     def _jump(self, k: int) -> Array | None:
@@ -206,14 +253,16 @@ class Coupling:
 
 
 def with_the_plant(log: Log, drawn: Drawn) -> Log:
-    """The log with what a simulated plant did while no process told it: it goes on, as the seed disturbs it."""
-    if not log.has_plant or not np.isnan(log.x).any():
+    """The log with what a simulated plant did and nobody told, or recorded: it goes on, as the seed disturbs it."""
+    if not log.has_plant:
         return log
     plant = log.gains.problem.plant
     x, w = log.x.copy(), np.where(np.isnan(log.w), drawn.w, log.w)
     for k in np.flatnonzero(np.isnan(x).any(axis=1)):
         x[k] = plant.A @ x[k - 1] + plant.B @ w[k - 1] if k else log.gains.problem.initial_error
-    return replace(log, x=x, w=w, z=np.where(np.isnan(log.z), x @ plant.M.T, log.z))
+    seen = np.array([node.seen for node in log.gains.problem.nodes])
+    measured = np.where(seen & np.isnan(log.measured), drawn.theta, log.measured)
+    return replace(log, x=x, w=w, z=np.where(np.isnan(log.z), x @ plant.M.T, log.z), measured=measured)
 
 
 def _absent(log: Log) -> Flags:
@@ -224,10 +273,11 @@ def _absent(log: Log) -> Flags:
 def _unsaid(log: Log) -> Flags:
     """(steps, n): so soon before a node was away, or before the log ends, that it may not have given its reasons.
 
-    A node that has given account of the last step has given them all. Where no event is in the file, nobody has.
+    A node that has given account of the last step has given them all, but for what was lost. Where no event is in the
+    file, nobody has.
     """
     absent = _absent(log) | (log.origin != -1)
-    unsaid: Flags = np.zeros(absent.shape, dtype=np.bool_)
+    unsaid: Flags = log.absences.untold[: log.steps].copy()
     for step, i in zip(*np.nonzero(absent), strict=True):
         unsaid[max(0, step - log.said.memory) : step + 1, i] = True
     for i in range(log.gains.problem.n):

@@ -20,14 +20,16 @@ from agent.contract.arrays import Array
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
 from agent.contract.keys import ACCOUNT, COORDINATOR, EVENT, EVIDENCE, PLANT, PLANT_STATE, measurement
-from agent.contract.messages import GONE, Account, Event
+from agent.contract.messages import Account, Event
 from agent.contract.recording import Logged
 from agent.contract.recording.evidence.examiner import Examiner, Findings
 from agent.contract.recording.ranges import ranges_of
 from agent.contract.recording.reader import Progress, RecordingReader
+from designer.replay.absences import Absences
 from designer.replay.census import Census, Facts, take_census
+from designer.replay.central import Flags
 from designer.replay.part import Part
-from designer.replay.said import Said, excused
+from designer.replay.said import Said
 from designer.replay.topics import GROWN, Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
 _MEMORY = 2.0  # seconds, and two steps, after which a node has said why it substituted something
@@ -71,6 +73,7 @@ class Log:
     heard: Numbers  # (steps, n): Estimate.heard
     told: Numbers  # (steps, n): Estimate.measured
     origin: Numbers  # (steps, n): Estimate.origin, by `Senders.origin`; -1 where a node goes on
+    absences: Absences  # why messages are not there, in a paced run
     said: Said  # what its events say of messages that were not there in time
     period: float  # seconds, of a paced run; 0 in lock-step
     grown: int | None  # the last step that is compared, because later ones may have numbers beyond the ceiling
@@ -92,7 +95,14 @@ class Log:
     @property
     def is_whole(self) -> bool:
         """The run is finished, and every message of it is there."""
-        return self.finished and not self.census.missing.total and not self.census.lacking.total
+        return self.finished and not (
+            self.census.missing.total or self.census.lacking.total or self.absences.lost.any()
+        )
+
+    @property
+    def is_part(self) -> bool:
+        """Something was left out of the file of a paced run, or it does not come to the end."""
+        return self.is_paced and (not self.finished or self.census.lacking.total > 0)
 
     def error_norms(self) -> Array:
         """|z_tilde(k)| over all nodes, as logged, (steps,); NaN where a message is missing."""
@@ -149,10 +159,18 @@ def _log(
     steps = min(last + 1, expected)
     _refuse_hollow(columns, steps, content.messages, path=reader.path)
     evidence = content.examiner.finish(end)
+    absences = content.absences(end, expected)
     census = take_census(
         topics.values(),
         columns,
-        content.facts(end, steps=expected, finished=finished, checked=not reader.is_unchecked, external=external),
+        content.facts(
+            end,
+            steps=expected,
+            finished=finished,
+            checked=not reader.is_unchecked,
+            external=external,
+            excused=absences.excused | absences.lost,
+        ),
         strange=strange,
         part=part,
     )
@@ -185,6 +203,7 @@ def _log(
         modes=content.modes,
         senders=content.senders,
         said=content.said,
+        absences=absences,
         period=content.period,
         grown=grown,
         **_arrays(columns, topics, problem.node_names, steps),
@@ -334,7 +353,14 @@ class _Content:
         return found
 
     def facts(
-        self, end: dict[str, str], *, steps: int, finished: bool, checked: bool, external: tuple[bool, ...]
+        self,
+        end: dict[str, str],
+        *,
+        steps: int,
+        finished: bool,
+        checked: bool,
+        external: tuple[bool, ...],
+        excused: Flags,
     ) -> Facts:
         """What the census must know beside the messages."""
         _, first = np.unique(np.array(self._keys, dtype=np.int64), return_index=True)
@@ -353,22 +379,30 @@ class _Content:
             events=np.array(self._events, dtype=np.int64)[first],
             event_copies=len(self._events) - len(first),
             recorded=recorded,
-            void={
-                key.removeprefix("void."): ranges_of(text)
-                for key, text in end.items()
-                if key.startswith("void.") and not self._kinds.isdisjoint({"resumed", GONE})
-            },
+            void=self._void(end),
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
-            excused=excused(
-                self.topics,
-                self.columns,
-                self.said,
-                self._external,
-                steps,
-                plant_is_whole=self.examiner.whole.get(PLANT) == recorded.get(PLANT, 0),
-            )
-            if self.is_paced
-            else None,
+            excused=excused,
+        )
+
+    def _void(self, end: dict[str, str]) -> dict[str, list[range]]:
+        """Of each sender, numbers that nobody looks for: they went with whoever held them; none in lock-step."""
+        found = {key.removeprefix("void."): ranges_of(text) for key, text in end.items() if key.startswith("void.")}
+        return found if self.is_paced else {}
+
+    def absences(self, end: dict[str, str], steps: int) -> Absences:
+        """Why messages are not there."""
+        steps = len(self.columns["has"][:steps])
+        if not self.is_paced:
+            return Absences.none(steps, len(self.topics), len(self._external))
+        return Absences.of(
+            self.topics,
+            self.columns,
+            self.said,
+            self._void(end),
+            external=self._external,
+            steps=steps,
+            plant_is_whole=str(self.examiner.whole.get(PLANT, 0)) == end.get(f"received.{PLANT}", "0"),
+            resumed="resumed" in self._kinds,
         )
 
 

@@ -12,9 +12,10 @@ from agent.contract.arrays import ulps
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
 from agent.contract.recording.evidence.examiner import Findings
 from designer.ledger.account import Account
-from designer.replay.census import Faults
+from designer.replay.census import Faults, Place
 from designer.replay.gamma import Gamma
 from designer.replay.part import Part
+from designer.replay.topics import NAMED
 
 if TYPE_CHECKING:
     from designer.replay.pacing import Pacing
@@ -132,7 +133,7 @@ class Verdict:
     is_doubtful: bool  # its checksum fails, so that any number in it may be a wrong one
     notes: tuple[str, ...]  # what is odd about the file, and harms nothing
     finished: bool  # the run came to its planned end, and the file is sound
-    whole: bool  # and every message of it is there
+    whole: bool  # and every message of it is there, so that all is judged
     is_simulated: bool  # a simulated plant is in the file
     external: tuple[str, ...]  # nodes with sensors of their own; where there are any, estimates are compared
     proofs: tuple[Proof, ...]
@@ -144,6 +145,8 @@ class Verdict:
     missing: Faults  # nothing explains that they are not there
     lacking: Faults  # not in this file, as after a filter, a cut or damage
     gaps: tuple[str, ...]  # what is lacking, in words
+    lost: int  # messages that went, by the recorder's account, with the process that held them
+    unknown: tuple[Place, ...]  # estimates that went so, and of which nothing is concluded
     duplicates: Faults  # of different content for the same step
     copies: int  # of equal content
     strange: tuple[str, ...]  # what should not be in the file
@@ -219,6 +222,9 @@ class Verdict:
             "lacking": self.lacking.total,
             "lacking_first": [place._asdict() for place in self.lacking.first],
             "lacking_words": list(self.gaps),
+            "lost": self.lost,
+            "unknown": len(self.unknown),
+            "unknown_first": [place._asdict() for place in self.unknown[:NAMED]],
             "copies": self.copies,
             "duplicates": self.duplicates.total,
             "duplicates_first": [place._asdict() for place in self.duplicates.first],
@@ -298,6 +304,10 @@ class Verdict:
         if self.gaps:
             how = "not in this file" if self.status in ("cut", "continues") or self.damage else "left out of this file"
             lines.append(f"{how}: {counted(self.lacking.total, 'message')} ({'; '.join(self.gaps)})")
+        if self.unknown:
+            named = ", ".join(f"{place.topic} step {place.step}" for place in self.unknown[:5])
+            more = f" and {len(self.unknown) - 5} more" if len(self.unknown) > 5 else ""
+            lines.append(f"unknown, and used by others, whose next estimates are not judged by them: {named}{more}")
         if self.gaps or self.damage:
             lines.append(f"the last complete step is {self.complete - 1}" if self.complete else "no step is complete")
         return [*lines, *(f"note: {note}" for note in self.notes)]

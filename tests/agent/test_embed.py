@@ -85,6 +85,31 @@ NETWORKS: dict[str, Callable[[], Gains]] = {
 }
 
 
+TOLD = r"""
+#include <stdio.h>
+#define ALL(what, n, ...) do { int i; printf(", \"" what "\": ["); for (i = 0; i < n; i++) { \
+    printf(i ? ", " : ""); printf(__VA_ARGS__); } printf("]"); } while (0)
+int main(void)
+{
+    int s, j;
+    printf("{\"name\": \"%s\", \"gains\": \"%s\", \"draws\": %d", THIS_NAME, THIS_GAINS, THIS_DRAWS);
+    ALL("nodes", THIS_NODES, "\"%s\"", this_nodes[i]);
+    ALL("senders", THIS_SENDERS, "[\"%s\", %d]", this_senders[i], this_ny[i]);
+    ALL("modes", THIS_MODES, "\"%s\"", this_modes[i]);
+    ALL("lossy", THIS_LOSSY, "[%d, %d, %.17g]", this_links[i].draw, this_links[i].sender, this_links[i].arrives);
+    printf(", \"hears\": [");
+    for (s = 0; s < THIS_MODES; s++) {
+        printf(s ? ", [" : "[");
+        for (j = 0; j < THIS_SENDERS; j++)
+            printf("%s%d", j ? ", " : "", this_hears[s][j]);
+        printf("]");
+    }
+    printf("]}");
+    return 0;
+}
+"""
+
+
 # the same bits
 @pytest.mark.parametrize("node", "1234")
 def test_a_golden_recording_comes_back(node: str, tmp_path: Path) -> None:
@@ -403,13 +428,41 @@ def test_two_nodes_fit_into_one_program(tmp_path: Path) -> None:
     assert (made.returncode, made.stderr) == (0, "")
 
 
+@pytest.mark.parametrize("kind", ["lossy links", "all, and names that C does not take"])
+def test_what_a_node_in_a_run_has_to_know_is_that_of_the_network(kind: str, tmp_path: Path) -> None:
+    """Names, whom it hears in which mode, how many numbers it is told, and which draws lose what."""
+    compiler, gains = tool("gcc", "cc", "clang"), NETWORKS[kind]()
+    problem, node = gains.problem, gains.problem.node_names[1]
+    name = export(gains, node, tmp_path)["name"]
+    (tmp_path / "told.c").write_text(f'#include "{name}_run.h"\n{TOLD}')
+    made = said(compiler, *STRICT, "-o", "told", "told.c", cwd=tmp_path)
+    assert (made.returncode, made.stderr) == (0, "")
+    heard = sorted({1, *problem.ever_heard(1)})
+    lossy = [
+        [draw, heard.index(problem.node_index(link.sender)), link.delivery_probability]
+        for draw, link in enumerate(problem.links)
+        if link.receiver == node
+    ]
+    assert lossy
+    assert json.loads(said(tmp_path / "told").stdout) == {
+        "name": node,
+        "gains": gains.digest(),
+        "nodes": list(problem.node_names),
+        "draws": len(problem.links),
+        "senders": [[problem.node_names[j], len(problem.nodes[j].C)] for j in heard],
+        "modes": list(problem.mode_names),
+        "hears": [[int(j in problem.neighbours(s, 1)) for j in heard] for s in range(len(problem.topologies))],
+        "lossy": lossy,
+    }
+
+
 def test_what_the_document_names_is_in_the_header(tmp_path: Path) -> None:
     """Functions, types and constants of node 2."""
     export(Gains.load(LOSSY), "2", tmp_path)
     there = set(re.findall(r"\w+", (tmp_path / "node_2.h").read_text()))
     named = set(re.findall(r"\b(?:node_2_|NODE_2_)\w+", (ROOT / "docs" / "embedded.md").read_text()))
     assert {"node_2_step", "NODE_2_GAINS"} < named
-    assert named - there - {"node_2_selftest"} == set()
+    assert named - there - {"node_2_selftest", "node_2_run"} == set()
 
 
 # the command
@@ -427,6 +480,7 @@ def test_the_command_tells_what_it_did(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "new/node2").iterdir()) == [
         "node_2.c",
         "node_2.h",
+        "node_2_run.h",
         "node_2_selftest.c",
     ]
 
@@ -496,7 +550,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         export(Gains.load(LOSSY), "1", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["node_1_selftest.c"]
     export(Gains.load(LOSSY), "1", tmp_path, force=True)
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_gains_beyond_float_are_refused(tmp_path: Path) -> None:

@@ -88,8 +88,11 @@ def test_what_a_guest_is_told(pair: Gains) -> None:
             'the command of node "n0", ./nowhere, cannot be started: there is no such program',
         ),
         (["--sensor", "n0='"], 'the command of sensor "n0", \', cannot be read: No closing quotation'),
-        (["--plant", " "], "the command of the plant is empty"),
-        (["--plant", "true", "--period", "1s", "--external", "n0"], "--plant true: no plant takes part in a paced run"),
+        (["--plant", " "], "--plant is empty; it takes a command"),
+        (
+            ["--plant", "true", "--period", "1s", "--external", "n0"],
+            "the plant is yours, but none takes part in a paced run",
+        ),
     ],
 )
 def test_a_guest_that_cannot_be_is_refused(
@@ -123,7 +126,7 @@ def test_guests_take_part_and_end_with_the_run(pair_path: Path, pair: Gains, tmp
     assert (summary["missing"], replay(recording).exit_code) == (0, 0)
     assert len(warnings) == 1, warnings
     assert re.fullmatch(
-        r'node "n0" did not end well after the run: its command, sh -c .*, ended with code 3, and said: oh', warnings[0]
+        r'node "n0" did not end well: its command, sh -c .*, ended with code 3, and said: oh', warnings[0]
     )
     wait_until_gone(list(processes(OUTLIVE)))
 

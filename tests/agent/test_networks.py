@@ -40,8 +40,9 @@ from agent.network.words import Refused
 from agent.pacing import beat
 from agent.plan import Pace, Plan
 from agent.roles import coordinator, node, suffering, timekeeper
-from designer.replay import log, replay
-from designer.replay.said import excused
+from designer.replay import absences, replay
+from designer.replay.absences import excused
+from designer.replay.coupling import Coupling
 
 SEEDS, BLOCK = 200, 25
 GAINS = random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
@@ -126,7 +127,7 @@ def test_a_planted_bug_is_found(
 
 # what seeds have found: each was broken until what its mutant takes away was there
 def _plants_that_are_never_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log, "excused", lambda *args, plant_is_whole: excused(*args, plant_is_whole=False))
+    monkeypatch.setattr(absences, "excused", lambda *args, plant_is_whole: excused(*args, plant_is_whole=False))
 
 
 def _a_start_for_everybody_who_hears_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,8 +143,24 @@ def _succession_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "went", lambda guard, who, session: went(guard, who, session) or None)
 
 
+def _what_is_lost_was_made_as_the_seed_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Coupling, "doubtful", lambda coupling: coupling)
+
+
+def _the_recorder_has_no_word_on_what_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(absences, "went_with", lambda topics, columns, void, steps: 0 * columns["has"][:steps] > 0)
+
+
+def _reasons_are_never_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    untold = absences.untold
+    monkeypatch.setattr(absences, "untold", lambda *run, memory: untold(*run, memory=memory) & False)
+
+
 FOUND = {
+    244: _what_is_lost_was_made_as_the_seed_says,
+    685: _the_recorder_has_no_word_on_what_is_lost,
     749: _a_start_for_everybody_who_hears_it,
+    1543: _reasons_are_never_lost,
     2697: _plants_that_are_never_whole,
     3171: _a_start_for_everybody_who_hears_it,
     3222: _greeted_though_the_one_before_may_still_be_heard,

@@ -282,6 +282,7 @@ def record(
     end_steps: int | None = None,
     received: Mapping[str, int] | None = None,
     evidence: bool = True,
+    void: Mapping[str, str] | None = None,
     **facts: str,
 ) -> Path:
     """Write the messages in the order given; returns where they are: `path`, or its .part where not `whole`.
@@ -289,7 +290,8 @@ def record(
     With `evidence` of them, for the first message of every number, as if these had been sent.
 
     `received` counts each sender's messages, as the recorder does; where it is not given, those of a whole run, and
-    of one without a plant where nothing of it is there and no node needs it.
+    of one without a plant where nothing of it is there and no node needs it. `void` are numbers of senders, as the
+    recorder writes them, that stand for nothing.
     """
     run = {"run": "test", "seed": str(seed), "steps": str(steps), "gains": gains.digest(), "external": "", **facts}
     chains, numbers = Chains(), set[tuple[str, int]]()
@@ -315,5 +317,6 @@ def record(
                 counts = {who: count for who, count in counts.items() if any(message.who == who for message in sent)}
             end = {"status": status, "reason": "", "steps": str(steps if end_steps is None else end_steps)}
             heads = {f"head.{who}": head for who, head in chains.heads().items() if evidence}
+            end |= {f"void.{who}": numbers for who, numbers in (void or {}).items()}
             writer.finish(end | {f"received.{who}": str(count) for who, count in counts.items()} | heads)
     return path if whole else path.with_name(path.name + ".part")

@@ -28,7 +28,7 @@ class Tolerance(NamedTuple):
 
 
 def tolerance(value: Any, most: float = math.inf) -> Tolerance:
-    """Of 0.02, or of "2%", both the decimals that they are written as. Raises ValueError: what would be right."""
+    """Of 0.02, or of "2%", both taken as the decimals that they are. Raises ValueError: what would be right."""
     part = isinstance(value, str) and value.endswith("%")
     text = value.removesuffix("%").strip() if isinstance(value, str) and part else value
     try:

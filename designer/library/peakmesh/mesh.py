@@ -1,4 +1,4 @@
-"""`Mesh`: a run that goes on in the background, with sensors of the user's."""
+"""`Mesh`: a run that goes on in the background, with nodes, sensors or a plant of the user's."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, Self
 
 from agent.contract.errors import EXIT_GOOD, EXIT_INPUT, InputError, RunBroken
 from agent.contract.gains import Gains
-from peakmesh import sensors as sensing
 from peakmesh.answers import Name, replay
+from peakmesh.functions import Cast, Command, Dynamics, Filter
 from peakmesh.running import file_of, new_name
+from peakmesh.sensors import Measure
 
 if TYPE_CHECKING:
     from designer.replay.verdict import Verdict
 
-GLANCE = 0.1  # seconds between looks at the sensors while the run is waited for
-GRACE = 5.0  # seconds for a run to end well after a sensor has failed: it may have failed at what ends last
-LAST_LOOK = 1.0  # seconds for each sensor to end, after a run that did not end well
+GLANCE = 0.1  # seconds between looks at the functions while the run is waited for
+GRACE = 5.0  # seconds for a run to end well after a function has failed: it may have failed at what ends last
 FAREWELL = 60.0  # seconds for a run to end in order, before it is killed
 
 
@@ -37,50 +37,48 @@ class Mesh:
         gains: Gains | Name,
         recording: Name,
         *,
-        sensors: Mapping[str, sensing.Source] | None = None,
+        nodes: Mapping[str, Filter | Command] | None = None,
+        sensors: Mapping[str, Measure | Command] | None = None,
+        plant: Dynamics | Command | None = None,
         external: Sequence[str] = (),
         steps: int = 50,
         **options: Any,
     ) -> None:
         """Start it, and return once the coordinator listens. `options` are those of `run`.
 
-        `sensors` has for a node what measures it: a function of the step that returns y, or a command in which {run},
-        {node} and {address} are put in. `external` names nodes with sensors that somebody else starts. Raises
-        InputError and RunBroken as `run` does.
+        Functions among `nodes`, `sensors` and `plant` are called in threads of this process. Raises InputError and
+        RunBroken as `run` does.
         """
         self.gains = gains if isinstance(gains, Gains) else Gains.load(gains)
         self.recording = Path(recording)
         self.run = options.setdefault("name", new_name(self.gains))
-        sensors = sensors or {}
-        for node in sensors:
-            self.gains.problem.node_index(node)
+        self._cast = Cast(self.gains, nodes=nodes or {}, sensors=sensors or {}, plant=plant)
         self.was_awaited = False  # whether somebody has asked how it ends
         self._verdict: Verdict | None = None
-        self._sensors: dict[str, sensing.Sensor] = {}
         with ExitStack() as stack:
             path = stack.enter_context(file_of(gains))
-            measured = [*external, *(node for node in sensors if node not in external)]
             arguments = options | {"gains": str(path), "recording": str(self.recording), "steps": steps}
+            arguments |= {"external": external, **self._cast.commands}
             self._said = stack.enter_context(tempfile.TemporaryFile())
-            self._process = stack.enter_context(self._started(arguments | {"external": measured}))
+            self._process = stack.enter_context(self._started(arguments))
             stack.callback(self._end)
             self.address = self._listening()
-            for node, source in sensors.items():
-                self._sensors[node] = sensing.start(source, run=self.run, node=node, address=self.address)
+            patience = {what: float(options.get(what, least)) for what, least in (("wait", 60.0), ("deadline", 10.0))}
+            self._cast.start(run=self.run, address=self.address, **patience)
             self._stack = stack.pop_all()
 
     def wait(self) -> None:
-        """Until the run is over. Raises RunBroken where it has not come to its end, or a sensor has failed before."""
+        """Until the run is over. Raises RunBroken where it has not come to its end, or a function has failed before."""
         self.was_awaited, failures = True, ""
         while self._process.poll() is None and not failures:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(GLANCE)
-            failures = self._failures()
+            failures = self._cast.failures()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE)
         if self._process.returncode == EXIT_GOOD:
             return
-        error, failures = self._error(), self._failures(LAST_LOOK)
+        error, failures = self._error(), self._cast.failures()
         self._end()
         raise RunBroken(failures) if failures else error
 
@@ -122,10 +120,6 @@ class Mesh:
             raise self._error()
         return str(json.loads(line)["listening"][0])
 
-    def _failures(self, seconds: float = 0.0) -> str:
-        failures = {node: sensor.failure(seconds) for node, sensor in self._sensors.items()}
-        return "; ".join(f'the sensor of node "{node}" failed: {why}' for node, why in failures.items() if why)
-
     def _error(self) -> InputError | RunBroken:
         """What the process has ended with."""
         code = self._process.returncode
@@ -135,13 +129,11 @@ class Mesh:
         return InputError(words) if code == EXIT_INPUT else RunBroken(words)
 
     def _end(self) -> None:
-        """Of the run and of the sensors: it first, so that nobody waits for them."""
+        """Of the run and of the functions: it first, so that nobody waits for them."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
             self._process.wait(FAREWELL)
         except subprocess.TimeoutExpired:
             self._process.kill()
-        for sensor in self._sensors.values():
-            sensor.close()
-        self._sensors.clear()
+        self._cast.close()

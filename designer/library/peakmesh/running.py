@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agent.commands.options import default_recording, plan_of
-from agent.contract.errors import InputError
+from agent.contract.errors import InputError, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.recording.parts import files_of, refuse_recording
+from agent.guests import guests
 from agent.launch import launch
 from agent.plan import LARGEST_WINDOW, Pace, Plan
 from peakmesh.answers import Name, replay
+from peakmesh.functions import Cast, Command, Dynamics, Filter
+from peakmesh.sensors import Measure
 
 if TYPE_CHECKING:
     from designer.replay.verdict import Verdict
@@ -54,6 +57,9 @@ def run(
     steps: int = 200,
     seed: int = 0,
     window: int = 32,
+    nodes: Mapping[str, Filter | Command] | None = None,
+    sensors: Mapping[str, Measure | Command] | None = None,
+    plant: Dynamics | Command | None = None,
     external: Sequence[str] = (),
     period: float | None = None,
     faults: Sequence[str] = (),
@@ -65,18 +71,37 @@ def run(
 ) -> Run:
     """Run a network (`peakmesh run`) and wait for its end; in notebooks, too.
 
-    `external` names nodes whose measurements come from sensors of yours; `period`, in seconds, makes it a paced run,
-    which survives `faults`; `deadline` is how many seconds without progress end it, `wait` how many all have to start.
+    `nodes`, `sensors` and `plant` are yours: commands, as `peakmesh run` takes them, or functions. A sensor is one of
+    the step that returns y (ny_i,); a node one of the mode and of (x_hat, innovation) of every node that was heard, by
+    name and with its own, that returns its next x_hat (nx,), eq. (5); the plant one of x (nx,) and w (nw,) that returns
+    the next x, eq. (1). `external` names nodes whose sensors somebody else starts; `period`, in seconds, makes it a
+    paced run, which survives `faults`; `deadline` is how many seconds without progress end it, `wait` how many all have
+    to start.
     `report` is told what happens as it does: {"listening": addresses}, {"started": time}, {"complete": steps}, ...
     Raises InputError, RunBroken where it does not come to its end, Interrupted on a signal; no process is left.
     """
     found = gains if isinstance(gains, Gains) else Gains.load(gains)
-    plan = _plan(found, steps, seed, window, external, period, faults, deadline)
+    cast = Cast(found, nodes=nodes or {}, sensors=sensors or {}, plant=plant)
+    named = [external] if isinstance(external, str) else external
+    measured = list(dict.fromkeys([*named, *(sensors or {})]))
+    plan = _plan(found, steps, seed, window, measured, period, faults, deadline)
+    invited = guests(found, **cast.commands)
     name = name or new_name(found)
     path = default_recording(name) if recording is None else Path(recording)
     refuse_recording(path, force=force)
-    with file_of(gains) as gains_path:
-        summary = launch(gains_path, found, plan, run=name, recording=path, force=force, wait=wait, report=report)
+
+    def heed(word: dict[str, Any]) -> None:
+        if "listening" in word:
+            cast.start(run=name, address=word["listening"][0], wait=wait, deadline=deadline)
+        report(word)
+
+    with file_of(gains) as gains_path, closing(cast):
+        try:
+            summary = launch(
+                gains_path, found, plan, run=name, recording=path, force=force, wait=wait, report=heed, guests=invited
+            )
+        except RunBroken as error:
+            raise (RunBroken(why) if (why := cast.failures()) else error) from None
     return Run(recording=path, parts=tuple(files_of(path)), run=name, seed=seed, **summary)
 
 
@@ -122,7 +147,7 @@ def _plan(
         seed=seed,
         window=window,
         deadline=deadline,
-        external=[external] if isinstance(external, str) else list(external),
+        external=list(external),
         period=period,
         fault=[faults] if isinstance(faults, str) else list(faults),
         measure_by=Pace(1.0).measure_by,

@@ -1,4 +1,4 @@
-"""Sensors of the user's: a function, in a thread of this process, or a command.
+"""Sensors that are functions, each in a thread of this process.
 
 A function is spoken for by what docs/sensor.py does, which needs zenoh and the protocol alone: a sensor is no role.
 """
@@ -6,74 +6,24 @@ A function is spoken for by what docs/sensor.py does, which needs zenoh and the 
 from __future__ import annotations
 
 import json
-import shlex
-import subprocess
-import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
-from agent.contract.errors import InputError
 from agent.contract.keys import COORDINATOR, MODE, RECORDER, alive, key, measurement, node_who, sensor_who
 
 PATIENCE = 60.0  # seconds for a function to return, which nobody can end
 
 Measure = Callable[[int], Sequence[float]]  # y(k) of step k
-Source = Measure | str | Sequence[str]  # or a command, in which {run}, {node} and {address} are put in
 
 
-class Sensor(Protocol):
-    """Measures one node of a run."""
+class Sensor:
+    """Measures one node of a run whose coordinator listens at `address`."""
 
-    def failure(self, seconds: float = 0.0) -> str | None:
-        """Why it measures no more; None where it has not ended within so many seconds, or has ended well."""
-
-    def close(self) -> None:
-        """End it, if it has not ended."""
-
-
-def start(source: Source, *, run: str, node: str, address: str) -> Sensor:
-    """Start a sensor for a run whose coordinator listens at `address`."""
-    if callable(source):
-        return _Function(source, run, node, address)
-    words = shlex.split(source) if isinstance(source, str) else [str(word) for word in source]
-    for place, value in (("{run}", run), ("{node}", node), ("{address}", address)):
-        words = [word.replace(place, value) for word in words]
-    return _Command(words)
-
-
-class _Command:
-    def __init__(self, words: list[str]) -> None:
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 -- closed with the sensor
-        try:
-            self._process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=self._said, start_new_session=True
-            )
-        except OSError as error:
-            self._said.close()
-            raise InputError(f'a sensor, "{words[0]}", cannot be started: {error.strerror}') from None
-
-    def failure(self, seconds: float = 0.0) -> str | None:
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(seconds)
-        if not (code := self._process.returncode):
-            return None
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        return f"it ended with code {code}{f', and said: {lines[-1]}' if lines else ''}"
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
-        self._said.close()
-
-
-class _Function:
-    def __init__(self, measure: Measure, run: str, node: str, address: str) -> None:
+    def __init__(self, measure: Measure, *, run: str, node: str, address: str) -> None:
         self._measure, self._run, self._node, self._address = measure, run, node, address
         self._tokens: SimpleQueue[str | None] = SimpleQueue()  # who is there; None: it is to end
         self._modes: SimpleQueue[bytes | None] = SimpleQueue()  # None: the run is over
@@ -81,10 +31,12 @@ class _Function:
         self._thread = threading.Thread(target=self._serve, name=sensor_who(node), daemon=True)
         self._thread.start()
 
-    def failure(self, seconds: float = 0.0) -> str | None:
+    def failure(self) -> str | None:
+        """Why it measures no more; None where it does, or has ended well."""
         return None if self._error is None else f"{type(self._error).__name__}: {self._error}"
 
     def close(self) -> None:
+        """End it, if it has not ended."""
         self._tokens.put(None)
         self._modes.put(None)
         self._thread.join(PATIENCE)

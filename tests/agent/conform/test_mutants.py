@@ -166,6 +166,13 @@ HANGS = {
 }
 
 CLOCKS = {
+    "speaks under another's key": (CLOCK, 'f"event/{WHO}"', '"event/node-gyro"', "under the key of another"),
+    "speaks for another": (
+        CLOCK,
+        "kind=kind, who=WHO",
+        'kind=kind, who="node-gyro"',
+        "refuse its message on event: .* forged",
+    ),
     "measured what was not there": (CLOCK, "measured=bool(y))", "measured=True)", "measured is True, must be False"),
     "heard what was not there": (
         CLOCK,

@@ -21,7 +21,8 @@ from designer import synthesis
 from designer.box import design as designing
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box, box_in, box_of, corners, within
-from designer.box.robust import problem_at, robust
+from designer.box.robust import robust
+from designer.box.worst import problem_at
 from designer.cli import main
 from designer.commands.design import design_text
 from designer.gain.exact import exact_gain

@@ -45,8 +45,8 @@ def test_our_own_node_passes(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_node_of_a_network_of_ones_own(capsys: pytest.CaptureFixture[str]) -> None:
     """As for a device, whose gains stand in its program."""
     own = ["--gains", str(GOLDEN / "zhu2020-lossy.gains.json"), "--node", "2"]
-    code, said = conform(capsys, *PATIENT, *own, "--only", "whole", "--only", "later", "--", sys.executable, PLAIN)
-    assert (code, [trial["trial"] for trial in said["trials"]]) == (0, ["whole", "later"])
+    code, said = conform(capsys, *PATIENT, *own, "--skip", "paced", "--skip", "again", "--", sys.executable, PLAIN)
+    assert (code, [trial["trial"] for trial in said["trials"]]) == (0, ["whole", *MORE[:-2]])
 
 
 def rounding(folder: Path) -> Path:
@@ -91,6 +91,8 @@ def test_what_would_be_tried_is_listed(capsys: pytest.CaptureFixture[str]) -> No
     [
         ([], "there is no command to try: peakmesh conform -- ./my_node"),
         (["--only", "fast", "--", "true"], '--only fast: there is no such trial; there are "ideal"'),
+        (["--skip", "slow", "--", "true"], '--skip slow: there is no such trial; there are "ideal"'),
+        (["--only", "ideal", "--skip", "ideal", "--", "true"], "--skip leaves nothing to try"),
         (["--node", "1", "--", "true"], "--gains FILE and --node NAME go together"),
         (["--", "./no-such-node"], "./no-such-node, cannot be started: there is no such program"),
         (["--", str(GOLDEN)], "cannot be started"),

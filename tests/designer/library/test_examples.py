@@ -26,7 +26,7 @@ def test_the_page_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     found = blocks(PAGE)
-    assert len(found) == 4
+    assert len(found) == 5
     for code, said in found:
         with redirect_stdout(StringIO()) as printed:
             exec(compile(code, "docs/library.md", "exec"), names)

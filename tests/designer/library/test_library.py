@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -180,6 +181,57 @@ def test_a_notebook_runs_a_network(tmp_path: Path, pair: Gains) -> None:
     assert roles_left() == {}
 
 
+def test_nodes_and_plant_may_be_functions(tmp_path: Path, pair: Gains) -> None:
+    """They are asked for each step in turn, and what they return is recorded; nothing of them is left."""
+    asked: list[tuple[str, list[str]]] = []
+
+    def node(mode: str, heard: dict[str, tuple[Any, Any]]) -> list[float]:
+        asked.append((mode, list(heard)))
+        heard["n0"][0][:] = np.nan  # it is a copy
+        return [1.0 + len(asked)] * pair.problem.nx
+
+    def plant(x: Any, w: Any) -> Any:
+        return x + w.sum() + 1.0
+
+    run = peakmesh.run(
+        pair, tmp_path / "run.mcap", steps=20, wait=PATIENCE, deadline=PATIENCE, nodes={"n0": node}, plant=plant
+    )
+    log = peakmesh.load(*run.parts)
+    assert log.x_hat[1:, : pair.problem.nx].tolist() == [[2.0 + k] * pair.problem.nx for k in range(19)]
+    assert len(asked) >= 19  # the last step leads to nothing, and the run may be over before
+    assert [mode for mode, _ in asked] == [log.modes.texts[s] for s in log.mode][: len(asked)]
+    assert all("n0" in heard for _, heard in asked)
+    assert np.array_equal(log.x[1:], log.x[:-1] + log.w[:-1].sum(axis=1, keepdims=True) + 1.0)
+    assert run.replay().exit_code == 1
+    assert roles_left() == {}
+    assert not {thread.name for thread in threading.enumerate()} & {"plant", "node-n0", "work"}
+
+
+@pytest.mark.parametrize(
+    ("who", "function", "sentence"),
+    [
+        ("nodes", lambda mode, heard: 1 / 0, 'node "n0" failed: ZeroDivisionError: division by zero'),
+        (
+            "plant",
+            lambda x, w: [1.0],
+            "the plant failed: ValueError: it returned an array of shape (1,); a state has shape (2,)",
+        ),
+        (
+            "plant",
+            lambda x, w: x + np.inf,
+            "the plant failed: ValueError: it returned [inf, inf]; a state has finite numbers",
+        ),
+    ],
+)
+def test_a_function_that_fails_ends_the_run(
+    who: str, function: Any, sentence: str, tmp_path: Path, pair: Gains
+) -> None:
+    mine = {who: {"n0": function} if who == "nodes" else function}
+    with pytest.raises(peakmesh.RunBroken) as broken:
+        peakmesh.run(pair, tmp_path / "run.mcap", steps=20, wait=PATIENCE, deadline=PATIENCE, **mine)
+    assert str(broken.value) == sentence
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -187,6 +239,8 @@ def test_a_notebook_runs_a_network(tmp_path: Path, pair: Gains) -> None:
         ({"seed": 1.5}, "seed is 1.5; it must be a whole number"),
         ({"period": 0}, "period is 0; it must be a number of seconds"),
         ({"external": "n9"}, 'node "n9" does not exist'),
+        ({"nodes": {"n9": abs}}, 'node "n9" does not exist'),
+        ({"plant": abs, "external": ["n0", "n1"], "period": 1.0}, "the plant is yours, but none takes part in a paced"),
         ({"faults": ["kill:node=n0,step=1"]}, "--fault kill:node=n0,step=1: a lock-step run survives nothing"),
     ],
 )

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from made_recordings import random_gains, random_problem
 from peakmesh import InputError, Mesh
@@ -42,6 +43,11 @@ def test_of_a_recording_that_was_changed(mesh):
     run.verdict()
 
 
+def test_of_a_plant_of_another_kind(mesh):
+    node = [sys.executable, "-m", "designer", "node", "--wait", "300", "--deadline", "300", "{gains}"]
+    mesh("gains.json", nodes={"n1": node}, plant=lambda x, w: 0.5 * x + w.sum(), steps=20)
+
+
 def test_that_expects_a_failure(mesh):
     run = mesh("gains.json", sensors={"n0": lambda step: "three"}, steps=20)
     with pytest.raises(Exception, match="ValueError: could not convert"):
@@ -51,7 +57,10 @@ def test_that_expects_a_failure(mesh):
 
 @pytest.fixture(scope="module")
 def pair() -> Gains:
-    return random_gains(random_problem(11, ny=(1, 2), modes=2))
+    """Every a_ij is 0 or 1."""
+    problem = random_problem(11, ny=(1, 2), modes=2)
+    weights = {topology.name: {"adjacency": np.sign(topology.adjacency)} for topology in problem.topologies}
+    return random_gains(problem.with_(topology=weights))
 
 
 def processes(word: object) -> dict[int, str]:
@@ -66,10 +75,11 @@ def processes(word: object) -> dict[int, str]:
 
 
 def of_docs() -> str:
-    """The test that docs/library.md shows, for a node that the gains here have; it has ten lines."""
-    (text,) = re.findall(r"```python\n(def test_.*?)```", (ROOT / "docs" / "library.md").read_text(), flags=re.DOTALL)
-    assert len([line for line in text.splitlines() if line.strip()]) <= 10
-    return str(text.replace('"level"', '"n0"'))
+    """The tests that docs/library.md shows, for a node that the gains here have; they have ten lines at most."""
+    found = re.findall(r"```python\n(def test_.*?)```", (ROOT / "docs" / "library.md").read_text(), flags=re.DOTALL)
+    assert all(len([line for line in text.splitlines() if line.strip()]) <= 10 for text in found)
+    assert [re.findall(r"def (test_\w+)", text) for text in found] == [["test_my_sensor"], ["test_my_filter"]]
+    return "\n\n".join(["import peakmesh", *found]).replace('"level"', '"n0"')
 
 
 def wait_until_nobody_has(word: object) -> None:
@@ -85,13 +95,14 @@ def test_tests_of_a_user(pytester: pytest.Pytester, pair: Gains) -> None:
     pytester.makepyfile(TESTS.replace("SENSOR", str(ROOT / "docs" / "sensor.py")), test_of_docs=of_docs())
     words = ["-n", "0", "-p", "no:cacheprovider", "--basetemp", str(pytester.path / "kept")]
     said = pytester.runpytest_subprocess(*words, timeout=PATIENCE)
-    said.assert_outcomes(passed=3, failed=2, errors=1)
+    said.assert_outcomes(passed=5, failed=2, errors=2)
     text = said.stdout.str()
-    assert 'the sensor of node "n0" failed: ZeroDivisionError: ' in text
+    assert 'sensor "n0" failed: ZeroDivisionError: ' in text
     assert "ValueError: mine" in text
-    kept = re.search(r"AssertionError: (.*run\.mcap): nothing can be said: it holds nothing to compare", text)
-    assert kept is not None
-    assert Path(kept[1]).exists()
+    for why in ("nothing can be said: it holds nothing to compare", "DIVERGES"):
+        kept = re.search(rf"AssertionError: (.*run\.mcap): {why}", text)
+        assert kept is not None
+        assert Path(kept[1]).exists()
     wait_until_nobody_has(pytester.path)
 
 
@@ -119,6 +130,8 @@ def test_a_mesh_that_cannot_start_says_why(tmp_path: Path, pair: Gains) -> None:
         Mesh(pair, tmp_path / "run.mcap", sensors={"n7": lambda step: [0.0]})
     with pytest.raises(InputError, match=r"^steps is 0; it must be a whole number"):
         Mesh(pair, tmp_path / "run.mcap", steps=0)
-    with pytest.raises(InputError, match=r"^a sensor, \"no-such-command\", cannot be started: No such file"):
+    with pytest.raises(
+        InputError, match=r"^the command of sensor \"n0\", no-such-command, cannot be started: there is"
+    ):
         Mesh(pair, tmp_path / "run.mcap", sensors={"n0": "no-such-command"})
     wait_until_nobody_has(tmp_path)

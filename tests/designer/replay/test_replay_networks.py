@@ -156,7 +156,8 @@ def test_the_path_gain_is_that_of_what_was_lost(tmp_path: Path) -> None:
                 for k in range(steps)
             ]
         )
-    responses = np.array(columns).transpose(1, 2, 0)  # (steps, n, steps nw)
+    weights = PROBLEM.weights[:, None]
+    responses = weights * np.array(columns).transpose(1, 2, 0)  # (steps, n, steps nw)
     expected = [np.linalg.norm(response, 2) for response in responses]
     log = load(record(tmp_path / "run.mcap", gains, sent, steps=steps))
     central = Central.of(log.gains)

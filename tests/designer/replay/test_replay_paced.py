@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from paced_runs import PACE, SOON, PacedRun
 from agent.contract.gains import Gains
 from agent.contract.messages import ZERO_STATE
 from designer.replay import replay
+from designer.replay.coupling import Coupling
 from designer.replay.verdict import Verdict
 
 STEPS = 60
@@ -225,6 +227,119 @@ def test_a_plant_need_not_have_come_to_the_end(tmp_path: Path, last: int) -> Non
     assert missing(whole_run(HIDDEN.problem, STEPS)) == last
     assert missing(sent, evidence=False) == last
     assert missing(sent, [m for m in short if m is not taken]) == last + 1
+
+
+# what went with the process that held it
+def lost_from(first: int, sent: list[Sent] = TRUE) -> list[Sent]:
+    """Node n1 was killed at the step AWAY.start, and no recorder had got what it sent from `first` on.
+
+    Its successor uses those numbers again, and nothing shows that there was something.
+    """
+    lost = [m for m in sent if m.who == "node-n1" and first <= m.document["step"] < AWAY.start]
+    numbers = {m.number for m in lost}
+    return [
+        m._replace(number=m.number - sum(number < m.number for number in numbers)) if m.who == "node-n1" else m
+        for m in sent
+        if m not in lost
+    ]
+
+
+def verdict_of_lost(folder: Path, first: int, sent: list[Sent] = TRUE) -> Verdict:
+    messages = lost_from(first, sent)
+    (folder / "run.mcap").unlink(missing_ok=True)
+    return verdict_of(folder, messages, received=Counter(m.who for m in messages))
+
+
+def with_change(sent: list[Sent], topic: str, step: int, mutate: Callable[[dict[str, Any]], None]) -> list[Sent]:
+    at = next(i for i, m in enumerate(sent) if m.topic == topic and m.document["step"] == step)
+    document = copy.deepcopy(sent[at].document)
+    mutate(document)
+    return [*sent[:at], sent[at]._replace(document=document), *sent[at + 1 :]]
+
+
+def shift(document: dict[str, Any]) -> None:
+    document["x_hat"][1] += 1e-6
+
+
+def who_used(sender: str, step: int) -> str:
+    """A node that says that it has used a pair of this step."""
+    heard = (m for m in TRUE if m.topic.endswith("estimate") and m.document["step"] == step + 1)
+    return next(m.who for m in heard if sender in m.document["heard"] and m.who != f"node-{sender}").removeprefix(
+        "node-"
+    )
+
+
+def test_an_estimate_that_was_used_and_lost_accuses_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody knows what it was made of; so what depends on it is not judged, and the run is not whole."""
+    verdict = verdict_of_lost(tmp_path, 26)
+    assert (verdict.outcome, verdict.exit_code) == ("agrees for what is there", 3), verdict.text()
+    assert verdict.unknown == (("node/n1/estimate", 27), ("node/n1/estimate", 28))
+    assert (
+        "unknown, and used by others, whose next estimates are not judged by them: node/n1/estimate" in verdict.text()
+    )
+    assert [proof.holds for proof in verdict.proofs] == [True, True, True, None, True]
+    assert verdict.document()["unknown"] == 2
+    monkeypatch.setattr(Coupling, "doubtful", lambda coupling: coupling)
+    assert verdict_of_lost(tmp_path, 26).exit_code == 1
+
+
+def test_an_estimate_that_can_be_inferred_is_known(tmp_path: Path) -> None:
+    """It was made as the seed says: what others made of it, to the last digits, says so."""
+    verdict = verdict_of_lost(tmp_path, 27)
+    assert (verdict.exit_code, verdict.unknown) == (0, ()), verdict.text()
+
+
+@pytest.mark.parametrize("first", [26, 27])
+def test_who_lies_about_what_it_made_of_a_lost_estimate_is_not_believed(tmp_path: Path, first: int) -> None:
+    """What is lost cannot be held against it; but nothing is said to agree as a whole."""
+    liar = who_used("n1", 28)
+    sent = with_change(TRUE, f"node/{liar}/estimate", 29, shift)
+    verdict = verdict_of_lost(tmp_path, first, sent)
+    assert verdict.exit_code != 0, verdict.text()
+    assert verdict.exit_code == 1 or ("node/n1/estimate", 28) in verdict.unknown
+
+
+@pytest.mark.parametrize("step", [20, AWAY.start + 3, STEPS - 1])
+def test_a_lie_elsewhere_is_found_whatever_was_lost(tmp_path: Path, step: int) -> None:
+    sent = with_change(TRUE, "node/n2/estimate", step, shift)
+    assert_found(verdict_of_lost(tmp_path, 26, sent), step=step, node="n2", field="x_hat[1]", proof=2)
+
+
+def test_nobody_has_heard_of_who_was_gone(tmp_path: Path) -> None:
+    """Who says that it has used an estimate long after its sender was seen to go has made it up."""
+    long_gone = AWAY.stop - 2
+    receiver = next(
+        name
+        for i, name in enumerate(HIDDEN.problem.node_names)
+        if name != "n1"
+        and HIDDEN.problem.node_index("n1")
+        in HIDDEN.problem.neighbours(HIDDEN.problem.mode_index(document_of("mode", long_gone)["mode"]), i)
+    )
+
+    def lie(document: dict[str, Any]) -> None:
+        document["heard"] = [*document["heard"], "n1"]
+        shift(document)
+
+    untold = [
+        m._replace(document={**m.document, "steps": [k for k in m.document["steps"] if k != long_gone]})
+        if m.who == f"node-{receiver}" and m.document.get("about") == "node/n1/estimate"
+        else m
+        for m in TRUE
+    ]
+    verdict = verdict_of_lost(tmp_path, 26, with_change(untold, f"node/{receiver}/estimate", long_gone + 1, lie))
+    assert verdict.exit_code == 1, verdict.text()
+
+
+def test_numbers_that_the_recorder_calls_void_are_lost(tmp_path: Path) -> None:
+    """Its own account: not missing, and not whole; without it they are missing."""
+    taken = [m for m in TRUE if m.topic == "node/n2/estimate" and m.document["step"] == 20]
+    sent = [m for m in TRUE if m not in taken]
+    path = record(
+        tmp_path / "run.mcap", HIDDEN, sent, steps=STEPS, period="0.1", void={"node-n2": str(taken[0].number)}
+    )
+    verdict = replay(path)
+    assert (verdict.outcome, verdict.lost, verdict.missing.total) == ("agrees for what is there", 1, 0), verdict.text()
+    assert "1 lost with the process that held them" in verdict.text()
 
 
 def by_sensors(sent: list[Sent]) -> list[Sent]:

@@ -103,7 +103,7 @@ class Examiner:
         is_renumbered = any(sender.is_renumbered for sender in senders)
         for sender in senders:  # a tool that numbers anew does so with everybody's messages
             sender.is_renumbered = is_renumbered
-            sender.judge(end.get(f"head.{sender.who}", ""))
+            sender.judge(end.get(f"head.{sender.who}", "") if end.get("status") != "continues" else "")
         return Findings(
             checked=sum(sender.checked for sender in senders),
             total=sum(sender.total for sender in senders),

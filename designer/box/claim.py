@@ -1,0 +1,54 @@
+"""What a gains file says of the box that its problem has: put into it by a design, and proved again."""
+
+from __future__ import annotations
+
+import math
+
+from agent.contract.errors import InputError
+from agent.contract.gains import BoxClaim, Gains
+from designer.box.extent import Box, box_in, truth_at
+from designer.box.robust import Robust, proved_at
+from designer.box.worst import Worst
+
+
+def with_claim(gains: Gains, found: Robust) -> Gains:
+    """The same gains, with what was found of them in the box that their problem has."""
+    claim = BoxClaim(
+        gamma=found.gamma,
+        why_not=None if found.gamma is not None else found.why_not,
+        found=found.found if math.isfinite(found.found) else None,
+        ends=found.worst.ends,
+        rows=found.worst.rows,
+        signs=found.worst.signs,
+    )
+    return gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"box": claim})})
+
+
+def again(gains: Gains, *, balls: bool = False) -> Robust | None:
+    """The claim of the file proved again, of the numbers and for the gamma that stand in it; None: it makes none.
+
+    Raises InputError where it cannot be about the problem in the file.
+    """
+    claim = gains.certificate.box
+    if claim is None or claim.gamma is None:
+        return None
+    box = box_in(gains.problem)
+    if box is None:
+        raise InputError("certificate: box: the problem has no tolerances, so there is nothing to claim of its box")
+    truth = truth_at(gains.problem, box, *_fitting(claim, box))
+    gain = math.inf if claim.found is None else claim.found
+    worst = Worst(truth, gain, claim.ends, claim.rows, claim.signs)
+    verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, balls=balls)
+    return Robust(box, worst, verdict)
+
+
+def _fitting(claim: BoxClaim, box: Box) -> tuple[tuple[bool, ...], tuple[int, ...], tuple[int, ...]]:
+    lengths = [("ends", claim.ends, len(box.intervals)), ("rows", claim.rows, len(box.rows))]
+    for name, found, length in [*lengths, ("signs", claim.signs, len(box.entries))]:
+        if len(found) != length:
+            raise InputError(f"certificate: box: {name} has {len(found)} entries; the box has {length} of the kind")
+    if any(not 0 <= k < len(rows) for k, rows in zip(claim.rows, box.rows, strict=True)):
+        raise InputError("certificate: box: rows names a corner that a row of the transition matrix does not have")
+    if any(sign not in (-1, 0, 1) for sign in claim.signs):
+        raise InputError("certificate: box: signs are -1, 0 or 1")
+    return claim.ends, claim.rows, claim.signs

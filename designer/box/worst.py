@@ -1,0 +1,97 @@
+"""The worst constant model of a box that a search finds, and its error model: in floats, a gain that the box has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from agent.contract.gains import LinkMatrices
+from agent.contract.problem import Problem
+from agent.contract.problem.matrices import matrices_of
+from designer.box.extent import Box, truth_at
+from designer.gain.exact import exact_gain
+from designer.model.error_model import ErrorModel, stacked_links
+from designer.model.mismatch import Real, real_error_model
+from designer.proof.ball_model import Truth
+
+_WIDTH = 1e-5  # of gamma^2: models are compared by that
+_ROUNDS = 3
+
+
+class Worst(NamedTuple):
+    """A corner that no change of a single probability, row or entry makes worse, or the last of so many rounds.
+
+    `ends`, `rows` and `signs` are those of `designer.box.extent.truth_at`, which gives `truth` for them.
+    """
+
+    truth: Truth
+    gain: float  # exact; infinite: not mean-square stable
+    ends: tuple[bool, ...]
+    rows: tuple[int, ...]
+    signs: tuple[int, ...]
+
+
+def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
+    """Its error model in floats, with filters as the problem has them."""
+    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
+    real = Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
+    carry = truth.carry or problem.carries_plant
+    return real_error_model(problem, problem.beta, real, *stacked_links(problem, K, H), carry=carry)
+
+
+def problem_at(problem: Problem, truth: Truth) -> Problem:
+    """The problem whose file says these probabilities. 0 and 1 are nearly that: a file has none of the former."""
+    document = problem.document()
+    for j, node in enumerate(document["node"]):
+        node["arrival_probability"] = truth.beta[j] if truth.beta[j] == problem.beta[j] else _inside(truth.beta[j])
+    for link in document.get("link", []):
+        at = problem.node_index(link["receiver"]), problem.node_index(link["sender"])
+        link["delivery_probability"] = max(float(truth.rho[at]), _inside(0.0))
+    document["markov"]["transition"] = [[float(pi) for pi in row] for row in truth.transition]
+    return Problem.from_document(document)
+
+
+def _inside(probability: float) -> float:
+    return min(max(float(probability), float(np.finfo(float).tiny)), 1.0 - 2.0**-53)
+
+
+def _ascent(
+    gain_at: Callable[[list[int]], float], at: list[int], most: float, choices: list[list[int]]
+) -> tuple[list[int], float]:
+    """One change after the other, as long as one makes it worse."""
+    for _ in range(_ROUNDS):
+        before = list(at)
+        for place, options in enumerate(choices):
+            for k in options:
+                tried = [*at[:place], k, *at[place + 1 :]]
+                gain = gain_at(tried) if k != at[place] and math.isfinite(most) else 0.0
+                if gain > most:
+                    at, most = tried, gain
+        if at == before:
+            break
+    return at, most
+
+
+def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst:
+    """Probabilities and rows first, with the matrices of the file; then each entry's sign alone; then all again."""
+    split, last = len(box.intervals), len(box.intervals) + len(box.rows)
+    choices: list[list[int]] = [[0, 1]] * split + [list(range(len(rows))) for rows in box.rows]
+    choices += [[-1, 1]] * len(box.entries)
+
+    def truth(at: list[int]) -> Truth:
+        return truth_at(problem, box, [bool(k) for k in at[:split]], at[split:last], at[last:])
+
+    def gain_at(at: list[int]) -> float:
+        gain = exact_gain(real_model(problem, K, H, truth(at)), width=_WIDTH)
+        return gain.low if gain.stable else math.inf
+
+    at = [0] * len(choices)
+    at, most = _ascent(gain_at, at, gain_at(at), choices[:last])
+    if box.entries and math.isfinite(most):
+        up = [gain_at([*at[:place], 1, *at[place + 1 :]]) for place in range(last, len(at))]
+        at = at[:last] + [1 if gain >= most else -1 for gain in up]
+        at, most = _ascent(gain_at, at, gain_at(at), choices)
+    return Worst(truth(at), most, tuple(bool(k) for k in at[:split]), tuple(at[split:last]), tuple(at[last:]))
