@@ -65,14 +65,14 @@ def design_exact(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
             "the plant that the disturbance drives; measure it"
         )
-    own, lmi_gamma = starts is None, None
+    own, lmi_gamma, stopped = starts is None, None, False
     if starts is None:
         try:
             starts, lmi_gamma = _starts(problem)
         except KeyboardInterrupt:
             if problem.plant.spectral_radius >= 1.0:
                 raise
-            own, starts, budget = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0)
+            own, starts, budget, stopped = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0), True
     lmi_exact = next(
         (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
     )
@@ -83,6 +83,7 @@ def design_exact(
         descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress)
+    descent = descent._replace(ended="interrupted") if stopped else descent
     chosen = descent.chosen
     if not chosen.gain.stable:
         raise Unattainable(
