@@ -118,9 +118,10 @@ class Prover:
 
         Of errors that decay slowly the steps that take long are made last.
         """
-        soon = min(most, _STEPS_BEFORE_LEAPS)
-        found = self.at_least_by_steps(gamma, most=soon) or self.at_least_by_leaps(gamma)
-        return found if found or most <= soon else self.at_least_by_steps(gamma, most=most)
+        if most <= _STEPS_BEFORE_LEAPS:
+            return self.at_least_by_steps(gamma, most=most)
+        soon = self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
+        return soon or self.at_least_by_leaps(gamma) or self.at_least_by_steps(gamma, most=most)
 
     def at_least_by_leaps(self, gamma: float) -> str | None:
         """The same where errors decay slowly and are few, by a w = Gamma eta that is held."""
@@ -133,15 +134,17 @@ class Prover:
         return by.name if any(false is not None for false in known) else None
 
     def at_least_by_steps(self, gamma: float, *, most: int) -> str | None:
-        """The same, one step after the other."""
-        for k in range(len(self._makes)):
-            by = self._arithmetic(k)
-            if k and by.order > _LARGEST_RECURSION:
-                break
-            steps = most if k == 0 else min(most, _STEPS_OF_DISPROOF)
-            if disproof(by, self._problem.mode_names, gamma, most=steps, P=self.P) is not None:
-                return by.name
-        return None
+        """The same, one step after the other; more than balls take are for floats alone."""
+        found = self._fails(0, gamma, most=most)
+        others = range(1, len(self._makes)) if most <= _STEPS_OF_DISPROOF else ()
+        return found or next((name for k in others if (name := self._fails(k, gamma, most=most))), None)
+
+    def _fails(self, k: int, gamma: float, *, most: int) -> str | None:
+        """The name of the arithmetic in which a W of the recursion is proved not to be positive definite."""
+        by = self._arithmetic(k)
+        if k and by.order > _LARGEST_RECURSION:
+            return None
+        return None if disproof(by, self._problem.mode_names, gamma, most=most, P=self.P) is None else by.name
 
     @cached_property
     def stable(self) -> Stability:

@@ -220,6 +220,8 @@ class _Search:
                 x = self._begin(x[:-1])
             else:
                 left.pop(0)
+            if self.barrier.horizon > _LONG_HORIZON:
+                left = [mu for mu in left if mu >= _LEAST_AT_LENGTH]
         return x
 
     def _keep(self, v: Array) -> tuple[Array | None, Decay]:
