@@ -20,7 +20,7 @@ from designer.model.error_model import StackedGains, error_model, link_gains, st
 from designer.proof.findings import Verdict
 from designer.proof.prover import FLOATS, MOST_STEPS_BELOW, Prover
 from designer.proof.recursion import MOST_STEPS
-from designer.search.descent import Budget, Descent, Progress, descend
+from designer.search.descent import Budget, Descent, Progress, descend, to_its_end
 from designer.search.effort import in_windows, refuse_without_memory, whole_fits
 from designer.search.quiet import Found, quieter
 from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
@@ -77,9 +77,12 @@ def design_exact(
             if problem.plant.spectral_radius >= 1.0:
                 raise
             own, starts, budget = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0)
-    lmi_exact = next(
-        (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
-    )
+    try:
+        lmi_exact = next(
+            (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
+        )
+    except KeyboardInterrupt:
+        lmi_exact, budget = None, Budget(0.0)
     if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
@@ -98,13 +101,13 @@ def design_exact(
         found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress)
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
         status = f"{_status_of_noise(found, unit)}; before: {status}"
-        gain = exact_gain(error_model(problem, *stacked))
+        gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
     solved = time.perf_counter()
     K, H = link_gains(problem, *stacked)
-    try:
-        certificate = certify(problem, K, H, gain=gain)
-    except KeyboardInterrupt:  # the search is over, and without a proof nothing would be left of it
-        certificate = certify(problem, K, H, gain=gain)
+    if progress is not None:
+        phase, spent = "proving gamma and the lower end of the exact gain", time.perf_counter() - started
+        progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase, over=True))
+    certificate = to_its_end(lambda: certify(problem, K, H, gain=gain))
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
