@@ -80,7 +80,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=duration,
         metavar="TIME",
-        help="how long method exact may search: 90s, 10min, 2h; a share of it is kept for the proof of what it has then "
+        help="how long method exact may search: 90s, 10min, 2h; a share is kept for the proof of what it has then "
         "(10min; 90s for small networks whose plant hardly decays)",
     )
 
