@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from agent.contract.keys import MODE, PLANT_STATE, estimate, measurement
+from agent.contract.keys import COORDINATOR, MODE, PLANT_STATE, estimate, measurement
 from agent.contract.messages import Stamp
 from agent.contract.problem import Problem
 
@@ -39,10 +39,13 @@ class Receipts:
             self._given_again(stamp, step)
         if step >= self.complete and topic in self._topics:
             self._there[step].add(topic)
-            while len(self._there.get(self.complete, ())) == len(self._topics):
-                del self._there[self.complete]
-                self.complete += 1
+            self._complete()
         return True
+
+    def _complete(self) -> None:
+        while len(self._there.get(self.complete, ())) == len(self._topics):
+            del self._there[self.complete]
+            self.complete += 1
 
     def lacking(self) -> list[str]:
         """The topics that keep the first incomplete step incomplete, in the order in which they come about."""
@@ -54,15 +57,22 @@ class Receipts:
         early, lost = self._early.get(sender), self.lost.get(sender, 0)
         return lost + (max(early) - self.received.get(sender, 0) - len(early) + 1 if early else 0)
 
-    def close_gap(self, sender: str) -> None:
-        """Expect the number after the last one that is there: whoever used those before is gone."""
-        early = self._early[sender]
-        if early:
-            self.lost[sender] = self.missing(sender)
-            self.void[sender] |= set(range(self.received.get(sender, 0), max(early))) - early
-            self.received[sender] = max(early) + 1
-            self._gone[sender] = self.reached[sender]
-            early.clear()
+    def close_gap(self, sender: str, *, below: int | None = None) -> None:
+        """Expect the number after the last one that is there, or after those `below`: nobody keeps the others."""
+        early, expected = self._early[sender], self.received.get(sender, 0)
+        end = max(early) + 1 if below is None and early else below or 0
+        if end > expected:
+            gone = set(range(expected, end)) - early
+            self.lost[sender] = self.lost.get(sender, 0) + len(gone)
+            self.void[sender] |= gone
+            if below is None:
+                self._gone[sender] = self.reached[sender]
+            self.received[sender] = end
+            early -= set(range(expected, end))
+            self._go_on(sender)
+        if below is not None and sender == COORDINATOR and self._topics == (MODE,):
+            self.complete = min(self._there, default=self.complete)  # the modes until there will not be given again
+            self._complete()
 
     def _given_again(self, stamp: Stamp, step: int) -> None:
         """A mode under a new number: the one that was lost, or a copy of one that is there."""
@@ -76,8 +86,13 @@ class Receipts:
         if number < expected or number in early:
             return False
         early.add(number)
+        self._go_on(sender)
+        return True
+
+    def _go_on(self, sender: str) -> None:
+        """Count the messages that follow those received, without a gap."""
+        expected, early = self.received.get(sender, 0), self._early[sender]
         while expected in early:
             early.remove(expected)
             expected += 1
         self.received[sender] = expected
-        return True

@@ -31,7 +31,7 @@ class Range(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The design for one value; numbers are None where there is none, and `reason` says why."""
+    """The design for one value; numbers are None where there is none; `reason` says why, or what was cut short."""
 
     value: float
     gamma: float | None  # certified
@@ -103,7 +103,7 @@ def sweep(
     points = []
     for point in each(_designed, jobs, dask=dask, processes=processes):
         points.append(point)
-        said = point.reason if point.gamma is None else f"gamma {point.gamma:.6g}"
+        said = "; ".join(filter(None, ["" if point.gamma is None else f"gamma {point.gamma:.6g}", point.reason]))
         report(len(points), len(jobs), f"{over.key} = {point.value:g}: {said}")
     return points
 
@@ -132,4 +132,6 @@ def _designed(job: _Job) -> Point:
         raise KeyboardInterrupt
     ladder = ladder_of(gains)
     exact = None if ladder.exact is None else ladder.exact[1]
-    return Point(job.value, ladder.gamma, exact, ladder.floor, ladder.theorem2, gains.seconds["total"], None)
+    is_cut = gains.solver.status.startswith("out of time")
+    unfinished = "the search was out of time; --budget gives it more" if is_cut else None
+    return Point(job.value, ladder.gamma, exact, ladder.floor, ladder.theorem2, gains.seconds["total"], unfinished)

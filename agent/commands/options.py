@@ -111,7 +111,7 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
     """Add what the recorder decides; `recording_plan_of` reads it."""
     parser.add_argument(
         "--split-size",
-        type=_size,
+        type=size,
         metavar="SIZE",
         help="begin a new part of the recording after so much, for example 100MB: FILE, FILE.part2, ... (never)",
     )
@@ -153,11 +153,12 @@ _BYTES = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "m
 _SECONDS = {"ms": 1e-3, "": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-def _size(text: str) -> int:
-    size = _with_unit(text, _BYTES)
-    if not 1000 <= size <= 1e15:
+def size(text: str) -> int:
+    """The type of options that say how many bytes."""
+    found = _with_unit(text, _BYTES)
+    if not 1000 <= found <= 1e15:
         raise argparse.ArgumentTypeError(f"{text} is not a size from 1kB on, such as 500kB, 100MB or 2GB")
-    return int(size)
+    return int(found)
 
 
 def _duration(text: str) -> float:

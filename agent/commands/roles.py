@@ -27,6 +27,7 @@ from agent.commands.options import (
     positive,
     recording_plan_of,
     run_name,
+    size,
 )
 from agent.commands.security import (
     add_insecure_option,
@@ -69,6 +70,14 @@ def add_roles(commands: Subcommands, environment: Mapping[str, str] = os.environ
         "--listen", default="tcp/127.0.0.1:7447", metavar="ADDRESS", help="where to be reached (tcp/127.0.0.1:7447)"
     )
     add_insecure_option(router)
+    for role in (node, plant, coordinator):
+        role.add_argument(
+            "--keep",
+            type=size,
+            default=64e6,
+            metavar="SIZE",
+            help="in a run against the clock, how much to keep in memory for a recorder that stays away (64MB)",
+        )
     for role in (node, plant, coordinator, recorder, live, router):
         heed_variables(role, environment)
 
@@ -260,7 +269,8 @@ def network_of(options: argparse.Namespace, who: str, problem: Problem | None) -
     refuse_insecure(listen, connect, keys=options.keys, insecure=options.insecure)
     deadline = options.deadline if "deadline" in options else 0.0  # a viewer's own patience is nobody's concern
     lease = max(LEAST_LEASE, 2.0 * deadline)
-    return Network(listen, connect, options.wait, lease=lease, credentials=credentials, problem=problem)
+    network = Network(listen, connect, options.wait, lease=lease, credentials=credentials, problem=problem)
+    return replace(network, keep=options.keep) if "keep" in options else network
 
 
 def _stop_with_launcher() -> None:

@@ -130,6 +130,7 @@ class Estimate(Message):
 ZERO_STATE = "the zero state"  # no node has such a name
 # kinds of events: why their `about` was substituted
 LATE, SILENT, GONE, REFUSED = "late", "silent", "gone", "refused"
+LOST = "lost"  # messages that will not be recorded
 
 
 class Event(Message):
@@ -309,6 +310,7 @@ class Acknowledged(Word):
     lacking: list[str]
     closed: bool
     broken_off: BrokenOff | None = None
+    lost: int = 0  # of those that are missing, what nobody keeps any more
     greets: str = ""  # who has just joined: `received` holds the number of their next message
 
 

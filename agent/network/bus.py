@@ -373,6 +373,10 @@ class Bus:
             raise ChannelClosed
         self._session.publish(self._outbox.add(topic, message.encode()))
 
+    def wait_for_nobody(self) -> None:
+        """In a paced run: keep no more for a recorder that stays away than was agreed on."""
+        self._outbox.most = self.network.keep
+
     def trace(self) -> None:
         """Have what is published from now on say when it was where, so that a receiver knows why it is late."""
         self._session.traced = True
@@ -426,8 +430,13 @@ class Bus:
 
     @property
     def unrecorded(self) -> int:
-        """How many of our messages the recorder has not got, as far as it has said."""
+        """How many of our messages that we keep the recorder has not got, as far as it has said."""
         return len(self._outbox)
+
+    @property
+    def dropped(self) -> int:
+        """How many of our messages we could not keep for the recorder."""
+        return self._outbox.dropped
 
     def order(self, control: Control) -> None:
         """The coordinator's word to everybody."""

@@ -32,6 +32,7 @@ class Network:
     connect: tuple[str, ...] = ()
     wait: float = 30.0  # seconds
     lease: float = 20.0  # seconds
+    keep: float = 64e6  # bytes: in a paced run, of what the recorder has not acknowledged
     routes: bool = False  # takes no part, but passes on what others say
     hosts: bool = False  # clients may be there though it has sockets
     sockets: Sockets | None = None

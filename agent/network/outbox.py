@@ -1,7 +1,13 @@
-"""What a participant has published: numbered, and kept until the recorder has acknowledged it."""
+"""What a participant has published: numbered, and kept until the recorder has acknowledged it.
+
+A run in lock-step waits for its recorder; one against the clock does not, and keeps no more than `most` bytes for one
+that stays away: the oldest messages go, and are lost for the record.
+"""
 
 from __future__ import annotations
 
+import math
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -26,7 +32,11 @@ class Outbox:
         self._who, self._session = who, session
         self._number = 0  # of the next message
         self._kept: deque[Sent] = deque()
+        self._bytes = 0  # of what is kept
+        self._lock = threading.Lock()  # held by whoever lets go of something
         self._has_sent = False
+        self.most = math.inf  # bytes
+        self.dropped = 0  # messages that the recorder had not acknowledged
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -47,7 +57,12 @@ class Outbox:
         sent = Sent(topic, payload, stamp)
         self._number += 1
         self._has_sent = True
-        self._kept.append(sent)
+        with self._lock:
+            self._kept.append(sent)
+            self._bytes += _size(sent)
+            while self._bytes > self.most and len(self._kept) > 1:
+                self._bytes -= _size(self._kept.popleft())
+                self.dropped += 1
         return sent
 
     def go_on(self, number: int) -> None:
@@ -60,5 +75,11 @@ class Outbox:
 
     def forget(self, received: int) -> None:
         """Drop the first `received` messages: the recorder has them."""
-        while self._kept and self._kept[0].stamp.number < received:
-            self._kept.popleft()
+        with self._lock:
+            while self._kept and self._kept[0].stamp.number < received:
+                self._bytes -= _size(self._kept.popleft())
+
+
+def _size(sent: Sent) -> int:
+    """In memory, about: the stamp, its digest and the rest take 320 bytes beside the payload."""
+    return len(sent.payload) + 320

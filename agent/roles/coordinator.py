@@ -30,6 +30,7 @@ from agent.contract.keys import (
 )
 from agent.contract.messages import (
     GONE,
+    LOST,
     REFUSED,
     Acknowledged,
     BrokenOff,
@@ -91,6 +92,7 @@ def run(bus: Bus, gains: Gains, plan: Plan, *, report: Callable[[Word], None]) -
     bus.advertise([MODE, EVENT])
     conductor, timekeeper = Conductor(bus, gains, plan, report), None
     if plan.pace is not None:
+        bus.wait_for_nobody()
         timekeeper = Timekeeper(bus, gains, plan, heed=conductor.heed, stood=conductor.stood)
     try:
         conductor.start()
@@ -137,6 +139,7 @@ class Conductor:
         self.complete = 0  # steps that the recorder has
         self._broken_off: BrokenOff | None = None
         self._lacking: list[str] = []
+        self._lost = 0  # messages that nobody keeps any more
         self._given = 0  # steps whose modes are out, in lock-step
         self._started = False
         self._identity = os.urandom(8).hex()
@@ -226,6 +229,7 @@ class Conductor:
         match word:
             case Acknowledged() as acknowledged:
                 self._heed(acknowledged.broken_off)
+                self._tell_lost(acknowledged.lost)
             case Refusals():
                 self._note(word)
             case Peer(who=who, present=present, succeeds=succeeds) if self._takes_part(who):
@@ -235,6 +239,13 @@ class Conductor:
                 self._welcome(word)
             case Peer(who=who, present=True):
                 self._doubt(who)
+
+    def _tell_lost(self, lost: int) -> None:
+        """Say what will not be recorded, as far as the recorder knows."""
+        if lost > self._lost:
+            self._lost = lost
+            gone = f"{counted(lost, 'message')} will not be recorded: nobody keeps them any more"
+            self._announce(LOST, gone, about=RECORDER)
 
     def _doubt(self, who: str) -> None:
         """Somebody is there whom nobody expects."""
@@ -262,7 +273,7 @@ class Conductor:
         return last_word
 
     def who_is_not_whole(self, last_word: Acknowledged) -> str:
-        """Of whom the last steps are not recorded: they stood still, or were gone, as the run ended."""
+        """Of whom the last steps are not recorded, who stood still or was gone as the run ended; and what is lost."""
         reached = {who: last_word.reached.get(who, -1) for who in self._everybody if who != RECORDER}
         short = [
             f"of {in_words(who)} {f'after step {last}' if last >= 0 else 'at all'}"
@@ -271,7 +282,10 @@ class Conductor:
         ]
         more = f" and of {len(short) - MOST_NAMED} more" if len(short) > MOST_NAMED else ""
         whom = ", ".join(short[:MOST_NAMED]) + more
-        return f"nothing is recorded {whom}; the last step is {self._plan.steps - 1}" if short else ""
+        found = [f"nothing is recorded {whom}; the last step is {self._plan.steps - 1}"] if short else []
+        if last_word.lost:
+            found.append(f"{counted(last_word.lost, 'message')} went with the process that held them, or were not kept")
+        return "; ".join(found)
 
     def stop(self, reason: str) -> Acknowledged | None:
         """Tell everybody why the run ends here, and wait for the recorder where there is something to close."""

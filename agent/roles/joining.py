@@ -27,6 +27,8 @@ def join(bus: Bus, gains: Gains) -> Control:
         bus.guard.begin(steps=start.steps, external=tuple(start.external), paced=start.period > 0.0)
         bus.has_begun, bus.is_late = True, start.step > 0
         bus.patient, bus.identity = start.period > 0.0, start.identity
+        if start.period:
+            bus.wait_for_nobody()
         if start.step and bus.who != RECORDER:
             bus.greeted()
         return start

@@ -26,7 +26,7 @@ from agent.guard import REPLAY, UNASKED, Unfit
 from agent.network.bus import Bus
 from agent.network.gate import MOST, Admitted, Gate, admit
 from agent.network.session import CAPACITY
-from agent.network.words import Peer, RunClosed, Sample
+from agent.network.words import Peer, Replayed, RunClosed, Sample
 from agent.plan import RecordingPlan
 from agent.roles.joining import join
 from agent.roles.record import Record
@@ -113,6 +113,7 @@ class Recorder:
         self._publishers = sorted({sender_of(topic) for topic in channels})
         self._quantum = max(1, window // 4)  # steps between acknowledgements
         self._acknowledged = 0
+        self._oldest: dict[str, int] = {}  # of each publisher, the first number that it has given again
         self._quiet_since = time.monotonic()
         self.broken_off: BrokenOff | None = None
 
@@ -128,11 +129,13 @@ class Recorder:
             match word:
                 case Sample():  # a replay that we asked for
                     self._take_replayed(word)
+                case Replayed(who=who):
+                    self._give_up(who)
                 case Ready(who=who, session=session, asks=True) if who in self._publishers:
                     if self._bus.guard.is_first(who, session):
                         self._greet(who)
-                case Peer(who=who, present=True) if self._is_late and who in self._publishers:
-                    self._ask(who)  # it was not there to be asked with everybody
+                case Peer(who=who, present=True) if self._ordeal is not None and who in self._publishers:
+                    self._ask(who)  # we were cut off, or it was not there to be asked with everybody
             pause = SHORTEST_PAUSE if self._take_waiting() else min(2.0 * pause, LONGEST_PAUSE)
             if time.monotonic() - self._quiet_since >= IDLE_SECONDS:
                 self._complain()
@@ -181,6 +184,9 @@ class Recorder:
             if sample.topic not in self._channels:
                 raise Unfit(UNASKED)
             self._take(admit(self._bus.guard, sample, for_record=True))
+            if sample.stamp is not None:
+                sender, number = sample.stamp.sender, sample.stamp.number
+                self._oldest[sender] = min(number, self._oldest.get(sender, number))
         except Unfit as unfit:
             self._bus.guard.refuse(REPLAY, unfit.kind)
 
@@ -191,6 +197,11 @@ class Recorder:
         self._bus.guard.now = self._record.receipts.complete
         if self._ordeal is not None and admitted.topic == MODE:
             suffer(self._ordeal.due(step))
+
+    def _give_up(self, who: str) -> None:
+        """All that `who` keeps has come. What it had sent before that, and we have not, it could not keep for us."""
+        if (oldest := self._oldest.pop(who, None)) is not None and self._ordeal is not None:
+            self._record.receipts.close_gap(who, below=oldest)
 
     def _heed_failure(self) -> None:
         """Tell everybody, once, that nothing can be recorded any more."""
@@ -235,6 +246,7 @@ class Recorder:
                 missing=sum(map(receipts.missing, receipts.reached)),
                 received=receipts.received,
                 reached=receipts.reached,
+                lost=sum(receipts.lost.values()),
                 lacking=lacking or [],
                 closed=closed,
                 broken_off=self.broken_off,

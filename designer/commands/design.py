@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from designer.ladder import Ladder
     from designer.search.descent import Progress
 
+_LONG_ENOUGH = 5.0  # seconds: whoever has waited so long is told what goes on after the search
 METHODS = (
     "exact: the least exact gain that a descent finds; decomposed: the optimum of Theorem 2's LMI node by node, for "
     "large networks; theorem2: that LMI as Zhu et al. 2020 print it; theorem2-reduced: the same for [x; e], faster; "
@@ -79,7 +80,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=duration,
         metavar="TIME",
-        help="how long method exact may search: 90s, 10min, 2h; what it has then is certified (10min)",
+        help="how long method exact may search: 90s, 10min, 2h; a share is kept for the proof of what it has then "
+        "(10min; 90s for small networks whose plant hardly decays)",
     )
 
 
@@ -155,7 +157,7 @@ def design_and_save(
     from designer.diagnosis import warnings
     from designer.ladder import ladder_of
     from designer.proof.certificate import stored_P
-    from designer.search.effort import BUDGET
+    from designer.search.effort import default_budget
     from designer.synthesis import design, design_in_box  # only now: it loads a solver
 
     box = asked(problem, within)
@@ -163,12 +165,18 @@ def design_and_save(
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
     noted = tell_notes(problem)
-    method, budget = method or _chosen_method(problem, budget), BUDGET if budget is None else budget
+    method, budget = method or _chosen_method(problem, budget), default_budget(problem) if budget is None else budget
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
-    with stoppable():
+    with stoppable() as search:
+        tell = _descent_progress()
+
+        def progress(at: Progress) -> None:
+            search.over |= at.over and box is None  # else the search on the worst models follows
+            tell(at)
+
         how: dict[str, Any] = {"method": method, "budget": budget, "dask": dask, "peak_slack": peak_slack}
-        how["progress"] = _descent_progress()
+        how["progress"] = progress
         found = None if box is None else design_in_box(problem, box, **how)
         gains = design(problem, **how) if found is None else found.gains
     if found is not None and not within:  # the box is in the file, and so is what is proved of it
@@ -212,9 +220,10 @@ def _refuse_nothing_to_spread(problem: Problem, method: str) -> None:
 
 def _chosen_method(problem: Problem, budget: float | None) -> str:
     """The default for this problem; on stderr why, where it is not the best one or takes long."""
-    from designer.search.effort import BUDGET, LONG, MOST_NODES, default_method, in_words, seconds_of_exact
+    from designer.search.effort import LONG, MOST_NODES, default_budget, default_method, in_words, seconds_of_exact
 
-    method, seconds, budget = default_method(problem), seconds_of_exact(problem), BUDGET if budget is None else budget
+    method, seconds = default_method(problem), seconds_of_exact(problem)
+    budget = default_budget(problem) if budget is None else budget
     if method != "exact":
         print(
             f"method {method}: of more than {MOST_NODES} nodes some hear too many others to be searched in windows; "
@@ -261,11 +270,15 @@ def design_text(result: dict[str, Any]) -> str:
 
 
 def _descent_progress() -> Callable[[Progress], None]:
-    """Prints where the descent is, every other second."""
+    """Prints where the descent is, every other second, and what comes after it where that may take long."""
     shown = 0.0
 
     def show(progress: Progress) -> None:
         nonlocal shown
+        if progress.phase is not None:
+            if progress.seconds >= _LONG_ENOUGH:
+                print(f"{progress.seconds:5.0f} s  {progress.phase}", file=sys.stderr)
+            return
         if progress.seconds >= shown + 2.0:
             shown = progress.seconds
             so_far = (

@@ -13,20 +13,25 @@ STOPPING = "stopping: the best gains so far are chosen and certified, which take
 STOPPED = "still at it: the search is over, and the gains are written as soon as they are certified"
 
 
+class Search:
+    """What signals may end."""
+
+    over = False  # all that is left is to be written
+
+
 @contextmanager
-def stoppable() -> Iterator[None]:
-    """The first signal raises KeyboardInterrupt, whichever it is; those after it are answered, and end nothing."""
-    came = False
+def stoppable() -> Iterator[Search]:
+    """The first signal raises KeyboardInterrupt, unless the search is over; those after it are answered alone."""
+    search = Search()
 
     def stop(number: int, frame: FrameType | None) -> None:
-        nonlocal came
-        print(STOPPED if came else STOPPING, file=sys.stderr, flush=True)
-        if not came:
-            came = True
+        print(STOPPED if search.over else STOPPING, file=sys.stderr, flush=True)
+        if not search.over:
+            search.over = True
             raise KeyboardInterrupt
 
     handlers = heed(stop)
     try:
-        yield
+        yield search
     finally:
         restore(handlers)

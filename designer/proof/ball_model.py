@@ -219,10 +219,13 @@ class BallModel:
         [A B]'Y_bar[A B] + sum of variance (E_l C_l)'Y_bar(E_l C_l), each (n_eta + nw, n_eta + nw). `partition`: the
         blocks of every Y(t), where they are known; else it is taken as one.
         """
-        return [self._joint(s, Y, partition or [self.eta]) for s in self.modes]
+        return [self.weighed(s, self._bar(s, Y), partition or [self.eta]) for s in self.modes]
 
-    def _joint(self, s: int, Y: list[arb_mat], partition: list[list[int]]) -> arb_mat:
-        Y_bar = sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
+    def _bar(self, s: int, Y: list[arb_mat]) -> arb_mat:
+        return sum((Y[t] * pi for t, pi in enumerate(self.transition[s]) if pi != 0), arb_mat(self.size, self.size))
+
+    def weighed(self, s: int, Y_bar: arb_mat, partition: list[list[int]]) -> arb_mat:
+        """The same of one mode, from Y_bar(s)."""
         S = self._mean(s, Y_bar, partition)
         for noise in self.noise[s]:
             core = noise.E.transpose() * part(Y_bar, noise.rows, noise.rows) * noise.E

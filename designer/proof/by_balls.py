@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import flint
 import numpy as np
 from flint import arb, arb_mat, ctx
@@ -12,6 +14,7 @@ from agent.contract.problem import Problem
 from designer.proof import balls
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import UNDECIDED, Sign, above, below, blocks, diagonal, exact, identity, of_blocks, part, sign
+from designer.proof.held_policies import HeldPolicies
 
 
 class ByBalls:
@@ -24,6 +27,7 @@ class ByBalls:
         with ctx.workprec(bits):
             self.model = BallModel(problem, K, H)
         self.order = self.model.size
+        self.unknowns = len(self.model.AB) * self.order * (self.order + 1) // 2  # entries of Y in all modes
 
     def inequality_17(self, P: Array) -> list[Sign]:
         n, model = self.model.size, self.model
@@ -78,6 +82,26 @@ class ByBalls:
         except ZeroDivisionError:  # too few bits
             return UNDECIDED, None
         return found, _rounded(grown, up=up)
+
+    def leap(self, Y: list[arb_mat], gamma: float, steps: int) -> list[arb_mat] | None:
+        with ctx.workprec(self.bits):
+            policies = [self._worst(S, gamma**2) for S in self.model.joint(Y)]
+            if not all(np.isfinite(Gamma).all() for Gamma in policies):
+                return None
+            return [below(Y_s) for Y_s in self._held.after(Y, [exact(Gamma) for Gamma in policies], gamma, steps)]
+
+    def _worst(self, S: arb_mat, g: float) -> Array:
+        """W^-1 B'Y_bar A in floats."""
+        n, joint = self.model.size, balls.floats(S)
+        with np.errstate(all="ignore"):
+            try:
+                return np.asarray(np.linalg.solve(g * np.eye(self.model.nw) - joint[n:, n:], joint[n:, :n]))
+            except np.linalg.LinAlgError:
+                return np.full((self.model.nw, n), np.nan)
+
+    @cached_property
+    def _held(self) -> HeldPolicies:
+        return HeldPolicies(self.model)
 
     def below(self, Y: list[arb_mat], P: Array, gamma: float) -> list[Sign]:
         with ctx.workprec(self.bits):

@@ -16,7 +16,7 @@ from agent.contract.problem import Problem
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
-from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, recursion
+from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_leaps, recursion
 
 Make = Callable[[Problem, LinkMatrices, LinkMatrices], Arithmetic]
 
@@ -28,6 +28,11 @@ _LARGEST_RECURSION = 130
 _LARGEST_INEQUALITY = 450
 _STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
 MOST_STEPS_BELOW = 20_000
+_STEPS_BEFORE_LEAPS = 1000
+_SLOW = 0.98  # radius
+_SHARES = (1 / 4, 1 / 32)  # of all steps so far that w = Gamma eta is held for
+_FORGOTTEN = 40.0  # e^-40 is left of what there was, after so many times the steps that errors last
+_LARGEST_LEAP = 130  # entries of Y in all modes: a second, if its powers are taken some hundred times
 _STEPS_OF_OTHERS = 5000  # with a P that is to end it early
 
 
@@ -109,15 +114,37 @@ class Prover:
         ]
 
     def at_least(self, gamma: float, *, most: int = MOST_STEPS_BELOW) -> str | None:
-        """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps."""
-        for k in range(len(self._makes)):
-            by = self._arithmetic(k)
-            if k and by.order > _LARGEST_RECURSION:
-                break
-            steps = most if k == 0 else min(most, _STEPS_OF_DISPROOF)
-            if disproof(by, self._problem.mode_names, gamma, most=steps, P=self.P) is not None:
-                return by.name
-        return None
+        """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps.
+
+        Of errors that decay slowly the steps that take long are made last.
+        """
+        if most <= _STEPS_BEFORE_LEAPS:
+            return self.at_least_by_steps(gamma, most=most)
+        soon = self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
+        return soon or self.at_least_by_leaps(gamma) or self.at_least_by_steps(gamma, most=most)
+
+    def at_least_by_leaps(self, gamma: float) -> str | None:
+        """The same where errors decay slowly and are few, by a w = Gamma eta that is held."""
+        by = next((by for k in range(len(self._makes)) if isinstance(by := self._arithmetic(k), ByBalls)), None)
+        radius = self._floats.model.decay.radius
+        if by is None or by.unknowns > _LARGEST_LEAP or not _SLOW < radius < 1.0:
+            return None
+        most, modes = int(_FORGOTTEN / (1.0 - radius)), self._problem.mode_names
+        known = (disproof_by_leaps(by, modes, gamma, most=most, share=share) for share in _SHARES)
+        return by.name if any(false is not None for false in known) else None
+
+    def at_least_by_steps(self, gamma: float, *, most: int) -> str | None:
+        """The same, one step after the other; more than balls take are for floats alone."""
+        found = self._fails(0, gamma, most=most)
+        others = range(1, len(self._makes)) if most <= _STEPS_OF_DISPROOF else ()
+        return found or next((name for k in others if (name := self._fails(k, gamma, most=most))), None)
+
+    def _fails(self, k: int, gamma: float, *, most: int) -> str | None:
+        """The name of the arithmetic in which a W of the recursion is proved not to be positive definite."""
+        by = self._arithmetic(k)
+        if k and by.order > _LARGEST_RECURSION:
+            return None
+        return None if disproof(by, self._problem.mode_names, gamma, most=most, P=self.P) is None else by.name
 
     @cached_property
     def stable(self) -> Stability:

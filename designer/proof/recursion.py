@@ -22,6 +22,7 @@ from designer.proof.findings import Finding, found, proved
 Modes = tuple[str, ...]
 MOST_STEPS = 100_000  # designs need fewer even where errors hardly decay
 _FEWEST = 500  # that are taken in networks of any size
+_FIRST = 100  # steps before w = Gamma eta is held
 MOST_NUMBERS = 8e9  # of all S(Y) together: about two minutes; at the exact gain itself a recursion has no end
 
 
@@ -102,6 +103,30 @@ def disproof(
             return false[0]
         if Y is None:
             break
+    return None
+
+
+class Leaping(Arithmetic, Protocol):
+    """One that takes many steps at once."""
+
+    def leap(self, Y: Any, gamma: float, steps: int) -> Any:
+        """Not above Y so many steps earlier, a power of two, w = Gamma eta held that is worst now; None: not found."""
+
+
+def disproof_by_leaps(by: Leaping, modes: Modes, gamma: float, *, most: int, share: float) -> Finding | None:
+    """As `disproof`, of errors that decay slowly: the worst w = Gamma eta hardly moves, and is held for ever longer."""
+    Y, done = by.start(up=False), 0
+    while done < most:
+        signs, Y = by.step(Y, gamma, up=False)
+        done += 1
+        false = [finding for finding in found("recursion", modes, signs, _at(done, gamma)) if finding.sign.refuted]
+        if false or Y is None:
+            return false[0] if false else None
+        if done >= _FIRST:
+            length = 2 ** (int(share * done).bit_length() - 1)
+            Y, done = by.leap(Y, gamma, length), done + length
+            if Y is None:
+                return None
     return None
 
 

@@ -388,6 +388,6 @@ def _census_proof(log: Log, *, is_whole: bool) -> Proof:
         steps = f" from step {census.lacking.first[0].step} on" if census.lacking.first else ""
         counts.append(f"{census.lacking.total} not in this file{steps}")
     if lost := int(log.absences.lost.sum()):
-        counts.append(f"{lost} lost with the process that held them")
+        counts.append(f"{lost} lost, by the recorder's account")
     holds = False if faulty else True if is_whole else None
     return Proof(4, holds, log.messages, 0.0, ", ".join(counts))

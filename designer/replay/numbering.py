@@ -1,7 +1,8 @@
 """The senders' own numbering, as far as it is still in the file, and what it says of messages that are not there.
 
-Numbers may be *void*: where a recorder was gone, and then whoever kept what it had not got. A coordinator that comes
-back gives out again, under new numbers, the modes that went so; the recorder says which numbers stand for nothing.
+Numbers may be *void*: where a recorder was gone, and then whoever kept what it had not got, or could not keep all. A
+coordinator that comes back gives out again, under new numbers, the modes that went so; the recorder says which numbers
+stand for nothing.
 """
 
 from __future__ import annotations
@@ -177,7 +178,8 @@ def _own(senders: list[_Sender], events: Numbers, absent: int | None) -> Numberi
             unseen.append(f"{count} more messages of {sender.who} are missing, by its numbers {first}")
     return Numbering(
         notes=tuple(
-            f"{counted(sender.void, 'number')} of {sender.who} went with a process that was gone, or are of copies"
+            f"{counted(sender.void, 'number')} of {sender.who} went with a process that was gone, were not kept, "
+            "or are of copies"
             for sender in senders
             if sender.void
         ),

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
 from designer.search.barrier import Barrier
 
+Made = TypeVar("Made")
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
 NEAR = 9e-4  # the first mu where the start is near
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
@@ -40,6 +41,7 @@ _SHORT_OF_MU = 0.3
 _COARSE = 1e-3  # of gamma^2, where starts are compared
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
+_SWEEPS_OF_THE_END = 40  # of the recursion: two exact gains, and a proof
 _NOTHING = 1e-200  # gamma^2 below this is 0
 _VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
@@ -54,6 +56,8 @@ class Progress(NamedTuple):
     seconds: float
     horizon: int  # T; the exact gain is that of all steps
     noise: float | None = None  # E|z_tilde|^2 in hand, where that is what falls
+    phase: str | None = None  # what goes on in place of a search
+    over: bool = False  # no search comes after it
 
 
 class Candidate(NamedTuple):
@@ -107,15 +111,19 @@ class Budget:
     """Seconds for a search, by a clock that may be another than that on the wall."""
 
     def __init__(self, seconds: float = math.inf, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.seconds, self._clock, self._begun = seconds, clock, clock()
+        self.seconds, self.kept, self._clock, self._begun = seconds, 0.0, clock, clock()
 
     @property
     def spent(self) -> float:
         return self._clock() - self._begun
 
+    def keep(self, seconds: float) -> None:
+        """So much for what comes after the search, but no more than half of all."""
+        self.kept = max(self.kept, min(seconds, self.seconds / 2.0))
+
     def check(self) -> None:
         """TimeIsUp where it is."""
-        if self.spent >= self.seconds:
+        if self.spent >= self.seconds - self.kept:
             raise TimeIsUp
 
     def watched(self, function: bfgs.Function) -> bfgs.Function:
@@ -126,6 +134,14 @@ class Budget:
             return function(x)
 
         return watched
+
+
+def to_its_end(work: Callable[[], Made]) -> Made:
+    """What is made after a search: Ctrl-C, which ends searches and comes once, does not end it."""
+    try:
+        return work()
+    except KeyboardInterrupt:
+        return work()
 
 
 class TimeIsUp(Exception):
@@ -161,10 +177,7 @@ def descend(
         ended = "interrupted"
     except TimeIsUp:
         ended = "out of time"
-    try:
-        least, chosen = search.choose(starts)
-    except KeyboardInterrupt:  # the search was over, and this takes seconds
-        least, chosen = search.choose(starts)
+    least, chosen = to_its_end(lambda: search.choose(starts))
     search.refuse_nothing(least.gain.high**2)
     return Descent(chosen, least, search.start, search.steps, ended)
 
@@ -235,7 +248,9 @@ class _Search:
     def _is_short(self, x: Array, P: Array, mu: float) -> bool:
         """Whether the exact gain of these gains is above sqrt(g)."""
         operator, above = self.barrier.operator(x[:-1]), 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
+        begun = self.budget.spent
         trial = recursion_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
+        self.budget.keep(_SWEEPS_OF_THE_END * (self.budget.spent - begun))
         return trial.holds is False and self._may_be_longer()
 
     def _begin(self, v: Array) -> Array:
@@ -294,6 +309,9 @@ class _Search:
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
         """The least gain of all that was found, and the gains to take."""
+        if self.progress is not None:
+            phase, horizon = "choosing among the gains found, by their exact gain", self.barrier.horizon
+            self.progress(Progress(self.start, 0.0, self.steps, math.inf, self.budget.spent, horizon, phase=phase))
         offered = [] if self.best is None else [self.best[:-1]]
         offered += [each.v for each in self.stable[-1:]]
         if not self.stable:

@@ -18,6 +18,11 @@ from designer.search.windows import windows
 
 MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
 BUDGET = 600.0  # seconds
+BUDGET_WHERE_SLOW, SLOW, FEW_STATES = (
+    90.0,
+    0.999,
+    40,
+)  # seconds, from this radius, for so many n nx: the rest gains little
 LONG = 60.0  # worth a word beforehand
 _GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
 _STEPS, _LEFT = 20, 2.0
@@ -34,6 +39,12 @@ def default_method(problem: Problem, *, designs: float = 1.0) -> str:
     if designs > 1.0:
         return "exact" if designs * seconds_of_exact(problem) <= BUDGET else "decomposed"
     return "exact" if problem.n <= MOST_NODES or in_windows(problem) else "decomposed"
+
+
+def default_budget(problem: Problem) -> float:
+    """Seconds that a search may take."""
+    slow = problem.carries_plant and problem.plant.spectral_radius >= SLOW
+    return BUDGET_WHERE_SLOW if slow and problem.n * problem.nx <= FEW_STATES else BUDGET
 
 
 def in_windows(problem: Problem) -> bool:

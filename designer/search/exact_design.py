@@ -18,8 +18,9 @@ from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.proof.findings import Verdict
-from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
-from designer.search.descent import Budget, Descent, Progress, descend
+from designer.proof.prover import FLOATS, MOST_STEPS_BELOW, Prover
+from designer.proof.recursion import MOST_STEPS
+from designer.search.descent import Budget, Descent, Progress, descend, to_its_end
 from designer.search.effort import in_windows, refuse_without_memory, whole_fits
 from designer.search.quiet import Found, quieter
 from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
@@ -31,8 +32,11 @@ _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
-_BELOW_WHERE_SLOW = (1e-6, 1e-3, 1e-1, 0.5)  # a W fails after many steps, if not far below
+_LEAPT = (1e-6, 3e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # below `high`, which takes little time; the last is tried first
+_FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if not far below
 _SLOW = 0.98  # radius
+_SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
+_A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -65,17 +69,20 @@ def design_exact(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
             "the plant that the disturbance drives; measure it"
         )
-    own, lmi_gamma = starts is None, None
+    own, lmi_gamma, stopped = starts is None, None, False
     if starts is None:
         try:
             starts, lmi_gamma = _starts(problem)
         except KeyboardInterrupt:
             if problem.plant.spectral_radius >= 1.0:
                 raise
-            own, starts, budget = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0)
-    lmi_exact = next(
-        (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
-    )
+            own, starts, budget, stopped = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0), True
+    try:
+        lmi_exact = next(
+            (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
+        )
+    except KeyboardInterrupt:
+        lmi_exact, budget, stopped = None, Budget(0.0), True
     if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
@@ -83,6 +90,7 @@ def design_exact(
         descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress)
+    descent = descent._replace(ended="interrupted") if stopped else descent
     chosen = descent.chosen
     if not chosen.gain.stable:
         raise Unattainable(
@@ -94,13 +102,13 @@ def design_exact(
         found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress)
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
         status = f"{_status_of_noise(found, unit)}; before: {status}"
-        gain = exact_gain(error_model(problem, *stacked))
+        gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
     solved = time.perf_counter()
     K, H = link_gains(problem, *stacked)
-    try:
-        certificate = certify(problem, K, H, gain=gain)
-    except KeyboardInterrupt:  # the search is over, and without a proof nothing would be left of it
-        certificate = certify(problem, K, H, gain=gain)
+    if progress is not None:
+        phase, spent = "proving gamma and the lower end of the exact gain", time.perf_counter() - started
+        progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase, over=True))
+    certificate = to_its_end(lambda: certify(problem, K, H, gain=gain))
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
     return Gains(
@@ -201,9 +209,11 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     if problem.n * problem.nx > _PROVED_STATES:
         return gain.low * (1.0 - _BELOW[3])
     prover, slow = Prover(problem, K, H), gain.radius > _SLOW
+    if slow and prover.at_least_by_leaps(gain.high * (1.0 - _LEAPT[-1])):
+        return next(low for part in _LEAPT if prover.at_least_by_leaps(low := gain.high * (1.0 - part)))
     most = MOST_STEPS_BELOW if slow else 2 * gain.horizon + 10
-    tried = (gain.low * (1.0 - part) for part in (_BELOW_WHERE_SLOW if slow else _BELOW))
-    return next((low for low in tried if low > 0.0 and prover.at_least(low, most=most)), 0.0)
+    tried = (gain.low * (1.0 - part) for part in (_FAR_BELOW if slow else _BELOW))
+    return next((low for low in tried if low > 0.0 and prover.at_least_by_steps(low, most=most)), 0.0)
 
 
 def _advice(problem: Problem) -> str:
@@ -221,10 +231,12 @@ def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *
 
     P satisfies (17); without one it is summed from the gains.
     """
-    for makes in (FLOATS, FLOATS + BALLS):
-        prover = Prover(problem, K, H, P=P, makes=makes)
-        for factor in _ABOVE:
-            verdict = prover.exact(high * factor)
+    by_floats = Prover(problem, K, H, P=P, makes=FLOATS)
+    soon = [(by_floats, _SOON, _A_LITTLE_LARGER)] if problem.n * problem.nx <= _FEW_STATES else []
+    at_length = [(prover, MOST_STEPS, _ABOVE) for prover in (by_floats, Prover(problem, K, H, P=P))]
+    for prover, most, factors in (*soon, *at_length):
+        for factor in factors:
+            verdict = prover.exact(high * factor, most=most)
             if verdict.holds:
                 return verdict
     return verdict

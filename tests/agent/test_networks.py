@@ -514,6 +514,32 @@ def test_a_publisher_that_is_asked_to_go_waits_for_no_recorder_that_stays_away()
         assert broken(outcome) == []
 
 
+def test_who_cannot_keep_everything_keeps_the_newest() -> None:
+    """The recorder is cut off for long: what was dropped is lost, and said to be; all goes on."""
+    away = asked(Trouble("part", RECORDER, 0.1, 12.0))
+    away = replace(away, plan=replace(away.plan, steps=300), keep=12_000.0)
+    with simulated(away) as outcome:
+        summary = outcome.summary
+        assert summary is not None
+        dropped = Counter(each.who for each in outcome.unrecorded)
+        assert dropped.keys() >= {"node-n0", PLANT}
+        assert summary.missing == dropped.total()
+        assert summary.not_whole.startswith(f"{dropped.total()} messages went with the process that held them, or")
+        for who in dropped:
+            numbers = [each.sent.stamp.number for each in outcome.unrecorded if each.who == who]
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            assert numbers[-1] < max(each.sent.stamp.number for each in outcome.published if each.who == who) - 10
+        told = [each.sent.payload for each in events(outcome, "lost")]
+        assert told
+        assert all(b"will not be recorded" in payload for payload in told)
+        verdict = replay(outcome.recording)
+        assert verdict.outcome == "agrees for what is there", verdict.text()
+        assert verdict.lost > 0
+    with simulated(replace(away, keep=64e6)) as outcome:
+        assert outcome.unrecorded == []
+        assert broken(outcome) == []
+
+
 def _void(outcome: Outcome) -> str:
     """The coordinator's numbers that stand for nothing, as the recording has them."""
     with RecordingReader(outcome.recording) as reader:

@@ -165,3 +165,21 @@ def test_a_gap_that_is_closed_counts_once() -> None:
     receipts.close_gap("node-n0")
     assert receipts.missing("node-n0") == 3
     assert receipts.void["node-n0"] == {1, 3, 4}
+
+
+def test_what_a_sender_could_not_keep_is_lost_and_nothing_after_it() -> None:
+    """Its oldest message is number 5; of what came early from there on, what is missing is still on its way."""
+    receipts = Receipts(PROBLEM, paced=True)
+    for number in (0, 3, 6, 9):
+        receipts.take("mode", number, Stamp(number, 0, "coordinator"))
+    assert receipts.complete == 1
+    receipts.close_gap("coordinator", below=5)
+    assert receipts.void["coordinator"] == {1, 2, 4}
+    assert (receipts.received["coordinator"], receipts.lost["coordinator"]) == (5, 3)
+    assert receipts.missing("coordinator") == 3 + 3
+    assert receipts.complete == 4  # modes before that, nobody gives again
+    for number in (5, 7, 8):
+        receipts.take("mode", number, Stamp(number, 0, "coordinator"))
+    assert (receipts.missing("coordinator"), receipts.received["coordinator"]) == (3, 10)
+    receipts.close_gap("coordinator", below=8)
+    assert receipts.lost["coordinator"] == 3

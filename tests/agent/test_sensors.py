@@ -53,7 +53,7 @@ def measured_by(
 def test_sensor_of_ones_own(pair_path: Path, tmp_path: Path, pair: Gains) -> None:
     """The script in docs/, plain zenoh, feeds one node; the others are simulated; the replay knows. All with keys."""
     lines = [line for line in SENSOR.read_text().splitlines() if line.strip()]
-    assert len(lines) <= 21
+    assert len(lines) <= 30
     assert not any("peakmesh import" in line or "import agent" in line for line in lines)
     name = pair.problem.node_names[0]
     keys = tmp_path / "keys"
@@ -135,3 +135,32 @@ def test_run_tells_where_the_sensor_is_to_connect(pair_path: Path, tmp_path: Pat
                 sensor.kill()
                 sensor.wait()
     assert len([m for m in logged(recording) if m.topic == f"node/{name}/measurement"]) == 20
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "python sensor.py RUN NODE ADDRESS-OF-COORDINATOR [KEYS]. For example: python sensor.py "),
+        (["a-run", "3"], "python sensor.py RUN NODE ADDRESS-OF-COORDINATOR [KEYS]. For example: python sensor.py "),
+        (["a-run", "3", "127.0.0.1:7447"], "sensor.py a-run 3 127.0.0.1:7447: no address like tcp/127.0.0.1:7447, "),
+        (["a-run", "3", "tcp/127.0.0.1:1", "no-such-file"], "or no KEYS like sensor-3.json5"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_a_sentence(words: list[str], said: str) -> None:
+    ran = subprocess.run([sys.executable, SENSOR, *words], capture_output=True, text=True, timeout=PATIENCE)
+    assert ran.returncode == 1
+    assert said in ran.stderr
+    assert ran.stderr.count("\n") == 1
+
+
+def test_a_sensor_that_finds_nobody_says_so(tmp_path: Path) -> None:
+    """It goes on waiting, for the others may come."""
+    script = tmp_path / "sensor.py"
+    script.write_text(SENSOR.read_text().replace("timeout=10", "timeout=0.1"))
+    words = [sys.executable, script, "a-run", "3", "tcp/127.0.0.1:1"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as sensor:
+        assert sensor.stderr is not None
+        for _ in range(2):
+            said = sensor.stderr.readline()
+            assert said == "sensor.py waits for coordinator, node-3, recorder of peakmesh/a-run at tcp/127.0.0.1:1\n"
+        sensor.kill()

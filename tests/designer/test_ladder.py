@@ -19,6 +19,7 @@ from designer.problems import find, names
 from designer.search.effort import (
     BUDGET,
     MOST_NODES,
+    default_budget,
     default_method,
     in_words,
     refuse_without_memory,
@@ -214,3 +215,11 @@ def test_commands_print_it_alone(
     assert (rows[0], rows[1][0]) == (["", "two-nodes"], "floor")
     assert main([command, "two-nodes", *words, "--force", "--table", "csv", "--json"]) == 2
     assert "leave one of them out" in capsys.readouterr().err
+
+
+def test_a_plant_that_hardly_decays_has_a_shorter_budget() -> None:
+    """Where the network is small; and that of others is as it was."""
+    quick = find("two-nodes")
+    document = quick.document()
+    document["plant"]["A"] = (np.array(document["plant"]["A"]) * 0.9999 / quick.plant.spectral_radius).tolist()
+    assert default_budget(Problem.from_document(document)) < default_budget(quick) == BUDGET

@@ -47,6 +47,13 @@ def test_a_value_without_gains_is_a_point_with_its_reason() -> None:
     assert many.gamma is not None
 
 
+def test_a_search_that_was_cut_short_says_so() -> None:
+    """Its numbers hold, and are no point of the curve that more time would give."""
+    (cut, _) = sweep(*problems("two-nodes", [f"{KEY}=0.5:1:2"]), method="exact", budget=1e-9, processes=1)
+    assert cut.gamma is not None
+    assert cut.reason == "the search was out of time; --budget gives it more"
+
+
 @pytest.mark.parametrize("settings", [[], [f"{KEY}=0.5"], [f"{KEY}=0.5:1:2", "plant.A.1.1=0.1:0.2:2"]])
 def test_a_sweep_is_over_one_key(settings: list[str]) -> None:
     with pytest.raises(InputError, match="a sweep needs one --set KEY=a:b:n"):
@@ -65,11 +72,17 @@ def test_the_command_writes_a_table(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0})  # in this process
     words = ["sweep", "two-nodes", "--set", f"{KEY}=0.5:1:2", "--method", "decomposed"]
-    assert main([*words, "-o", "curve.csv", "--json"]) == 0
-    points = json.loads(capsys.readouterr().out)["points"]
+    assert main([*words, "-o", "curve.csv", "--json", "--figures", "figures", "--format", "svg"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    points = told["points"]
+    assert told["figures"] == ["figures/sweep-one-column.svg", "figures/sweep-two-columns.svg"]
+    assert all(Path(figure).read_bytes().startswith(b"<?xml") for figure in told["figures"])
     with Path("curve.csv").open() as file:
         header, *rows = csv.reader(file)
     assert header[:2] == [KEY, "gamma"]
     assert [[float(entry) for entry in row[:2]] for row in rows] == [[p["value"], p["gamma"]] for p in points]
     assert main([*words, "-o", "curve.csv"]) == 2
+    assert main([*words, "--figures", "figures", "--format", "svg"]) == 2  # before any design
+    assert main([*words, "--format", "svg"]) == 2
+    assert "1 of 2 designs" not in capsys.readouterr().err
     assert main(["sweep", "two-nodes", *words[2:], "--set", "node.*.loss=lost"]) == 2

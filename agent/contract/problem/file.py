@@ -11,6 +11,7 @@ import numpy as np
 from agent.contract.errors import InputError, listed, shortened
 from agent.contract.files import kind_of, read_bytes
 from agent.contract.problem.consistency import refuse_duplicates
+from agent.contract.problem.parts import is_legal
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -48,7 +49,7 @@ def adjacency_from_hears(document: Any) -> Any:
         return document
     nodes = document.get("node")
     nodes = [node.get("name") for node in nodes if isinstance(node, dict)] if isinstance(nodes, list | tuple) else []
-    if not nodes:
+    if not nodes or not all(map(is_legal, nodes)):
         return {**document, "topology": []}  # that is the fault to report, not the names that nobody has
     refuse_duplicates("node", tuple(nodes))  # before names are looked up among them
     topologies = [_with_adjacency(topology, nodes) for topology in document["topology"]]

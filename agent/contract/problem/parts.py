@@ -14,8 +14,13 @@ from agent.contract.problem.sampling import sampled
 from agent.contract.problem.uncertainty import OfChain, OfLink, OfNode, OfPlant, check_shape
 
 
+def is_legal(name: Any) -> bool:
+    """Whether a node or a mode may have this name: it becomes a part of key expressions, and of columns."""
+    return isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name) is not None
+
+
 def _legal_name(name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,64}", name):
+    if not is_legal(name):
         raise ValueError(f'{shortened(name)} is not a legal name: use 1 to 64 letters, digits, "-" and "_"')
     return name
 

@@ -20,6 +20,7 @@ def parse(*words: str, **environment: str) -> argparse.Namespace:
 
 VALUES = {  # of the options whose value is neither a name nor a number of seconds
     "node": "n7", "run": "r", "listen": "none", "host": "::1", "output": "x", "on_record_failure": "continue",
+    "keep": "5MB",
     "split_size": "5MB", "split_duration": "2s", "period": "2s", "steps": "7", "seed": "7", "window": "7", "port": "7",
 }  # fmt: skip
 

@@ -14,6 +14,7 @@ from designer.cli import main
 from designer.commands import design as command
 from designer.commands.stopping import STOPPED, STOPPING
 from designer.search import exact_design
+from designer.search.descent import Progress
 
 
 def raising(number: int, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -41,6 +42,26 @@ def test_a_signal_ends_the_search_and_a_second_one_nothing(
     assert Gains.load(tmp_path / "gains.json").solver.status.startswith("interrupted")
     assert main(["verify", str(tmp_path / "gains.json")]) == 0
     assert {number: signal.getsignal(number) for number in before} == before
+
+
+@pytest.mark.parametrize("work", ["certify", "recover"])
+def test_a_signal_outside_the_search_leaves_a_file(
+    work: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the proof it ends nothing; before the search it ends what has not begun."""
+    monkeypatch.setattr(exact_design, work, raising(signal.SIGINT, getattr(exact_design, work)))
+    assert main(["design", "two-nodes", "-o", str(tmp_path / "gains.json")]) == 0
+    said, status = capsys.readouterr().err, Gains.load(tmp_path / "gains.json").solver.status
+    assert (STOPPED if work == "certify" else STOPPING) in said
+    assert status.startswith("converged" if work == "certify" else "out of time")
+    assert main(["verify", str(tmp_path / "gains.json")]) == 0
+
+
+def test_what_goes_on_after_a_long_search_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    show = command._descent_progress()
+    for seconds, phase in ((1.0, "proving gamma"), (50.0, "proving gamma"), (50.5, "choosing")):
+        show(Progress("x", 0.0, 1, 1.0, seconds, 20, phase=phase))
+    assert capsys.readouterr().err.splitlines() == ["   50 s  proving gamma", "   50 s  choosing"]
 
 
 def test_a_signal_before_the_search_leaves_gains_that_ignore_everything(

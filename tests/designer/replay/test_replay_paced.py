@@ -339,7 +339,7 @@ def test_numbers_that_the_recorder_calls_void_are_lost(tmp_path: Path) -> None:
     )
     verdict = replay(path)
     assert (verdict.outcome, verdict.lost, verdict.missing.total) == ("agrees for what is there", 1, 0), verdict.text()
-    assert "1 lost with the process that held them" in verdict.text()
+    assert "1 lost, by the recorder's account" in verdict.text()
 
 
 def by_sensors(sent: list[Sent]) -> list[Sent]:

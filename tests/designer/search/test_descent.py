@@ -26,7 +26,7 @@ from designer.model.units import Units, rescaled
 from designer.problems import find
 from designer.search import descent
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Descent, Progress, descend
+from designer.search.descent import Budget, Descent, Progress, TimeIsUp, descend, to_its_end
 from designer.search.effort import gradients_of_exact
 from designer.search.starts import consensus_gains, least_variance_gains
 
@@ -178,7 +178,7 @@ def test_an_interrupted_search_keeps_the_best_so_far() -> None:
 
     def interrupt(progress: Progress) -> None:
         reported.append(progress)
-        if progress.steps == 25:
+        if progress.steps == 25 and progress.phase is None:
             raise KeyboardInterrupt
 
     found = descend(problem, {"consensus": consensus_gains(problem, weight=0.2)}, progress=interrupt)
@@ -234,3 +234,29 @@ def test_a_large_network_goes_below_least_variance_within_a_few_steps() -> None:
     budget = Budget(40.0, clock=partial(next, count(-1.0)))
     found = descend(problem, {"least variance": start}, budget=budget)
     assert found.chosen.gain.high < 0.95 * exact_gain(error_model(problem, *start)).high
+
+
+def test_a_budget_keeps_a_share_for_the_proof() -> None:
+    """As long as proofs have taken, but half of all at most."""
+    now = 0.0
+    budget = Budget(100.0, clock=lambda: now)
+    budget.keep(30.0)
+    now = 69.0
+    budget.check()
+    now = 70.0
+    with pytest.raises(TimeIsUp):
+        budget.check()
+    budget.keep(1000.0)
+    assert budget.kept == 50.0
+    Budget().keep(1000.0)  # no end, no share
+
+
+def test_what_comes_after_a_search_is_not_ended_by_what_ended_it() -> None:
+    to_come: list[type[BaseException]] = [KeyboardInterrupt]
+
+    def work() -> int:
+        if to_come:
+            raise to_come.pop()
+        return 7
+
+    assert to_its_end(work) == 7

@@ -137,3 +137,13 @@ def test_ctrl_c_in_any_phase_leaves_gains_that_are_certified(phase: str, monkeyp
     gains = design_exact(problem, starts={"least variance": least_variance_gains(problem)})
     assert pressed
     assert verify(gains).holds
+
+
+def test_ctrl_c_before_the_search_is_not_called_a_want_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(problem: Problem) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(exact_design, "_starts", interrupted)
+    gains = design_exact(find("two-nodes"))
+    assert gains.solver.status.startswith("interrupted; from ignoring all measurements")
+    assert verify(gains).holds

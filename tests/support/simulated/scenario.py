@@ -40,6 +40,7 @@ class Scenario:
     weather: Weather
     troubles: tuple[Trouble, ...] = ()
     wait: float = 20.0
+    keep: float = 64e6  # bytes
     starts: dict[str, float] = field(default_factory=dict)  # when each process is started, in seconds
 
     @property

@@ -139,7 +139,12 @@ class World:
             member.process.on_signal = handler
             return {}
 
-        network = Network(connect=() if who == COORDINATOR else ("tcp/simulated",), wait=scenario.wait, lease=LEASE)
+        network = Network(
+            connect=() if who == COORDINATOR else ("tcp/simulated",),
+            wait=scenario.wait,
+            lease=LEASE,
+            keep=scenario.keep,
+        )
         door: Any = partial(Door, self.net, self.published)
         with Bus(network, run=RUN, who=who, session=door, signals=keep) as bus:
             if who == COORDINATOR:

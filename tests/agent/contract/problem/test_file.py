@@ -64,6 +64,9 @@ REFUSED = [
      'topology "joined": hears: node 2 does not exist; the nodes are "left" and "right"'),
     (edited(JOINED, 'hears = { left = "right" }'),
      'topology "joined": hears must map a node to a list of nodes, such as { "1" = ["4"] }'),
+    # a name that is none, before it is missed in hears
+    (edited(JOINED, 'hears = { right = ["left"] }').replace('"left"', '"the left"', 1),
+     'node "the left": name: \'the left\' is not a legal name: use 1 to 64 letters, digits, "-" and "_"'),
     # tables that are none
     ("plant = 3\n" + TEXT.split("[plant]")[0] + TEXT[TEXT.index("[[node]]") :],
      "plant: must be a table of keys and values, got 3"),

@@ -1,0 +1,67 @@
+"""Many steps of the recursion at once, from below: with w = Gamma eta held a step is linear, and powers are squared.
+
+A step leads from Y to the maximum over w, so to no less than L_c(Y) - g Gamma'Gamma for any Gamma; L_c(Y) is
+[I; Gamma]'S(Y)[I; Gamma], and rises with Y. So what many steps of that lead to is not above what as many steps of the
+recursion lead to, unless one of these has a W that is not positive definite, which is as good; docs/theory.md, 4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from flint import arb, arb_mat
+
+from designer.proof.ball_model import BallModel
+from designer.proof.balls import identity
+
+
+class HeldPolicies:
+    """Symmetric matrices of all modes as vectors of their upper triangles, one mode after the other, and a 1."""
+
+    def __init__(self, model: BallModel) -> None:
+        self._model = model
+        self._places = [(int(i), int(j)) for i, j in zip(*np.triu_indices(model.size), strict=True)]
+        self._weighed = [
+            [model.weighed(s, _unit(model.size, *at), [model.eta]) for at in self._places] for s in model.modes
+        ]
+
+    def after(self, Y: list[arb_mat], policies: list[arb_mat], gamma: float, steps: int) -> list[arb_mat]:
+        """Not above Y after so many steps of the recursion at gamma^2, a power of two, w = Gamma eta by mode."""
+        step = self._step(policies, arb(gamma) ** 2)
+        vector = arb_mat(step.nrows(), 1, [*(Y_s[at] for Y_s in Y for at in self._places), arb(1)])
+        while steps % 2 == 0 and steps > step.nrows():
+            step, steps = step * step, steps // 2
+        for _ in range(steps):
+            vector = step * vector
+        return self._matrices(vector)
+
+    def _step(self, policies: list[arb_mat], g: arb) -> arb_mat:
+        """Y <- L_c(Y) - g Gamma'Gamma, as a matrix."""
+        model, size = self._model, len(self._places)
+        step = arb_mat(model.modes.stop * size + 1, model.modes.stop * size + 1)
+        step[step.nrows() - 1, step.nrows() - 1] = 1
+        for s, Gamma in enumerate(policies):
+            closed = arb_mat(model.size + model.nw, model.size, identity(model.size).entries() + Gamma.entries())
+            spent = Gamma.transpose() * Gamma * g
+            for k, at in enumerate(self._places):
+                step[s * size + k, step.ncols() - 1] = -spent[at]
+            for column, S in enumerate(self._weighed[s]):
+                moved = closed.transpose() * S * closed
+                for t, pi in enumerate(model.transition[s]):
+                    for k, at in enumerate(self._places):
+                        step[s * size + k, t * size + column] = moved[at] * pi
+        return step
+
+    def _matrices(self, vector: arb_mat) -> list[arb_mat]:
+        found, entries, n = [], iter(vector.entries()), self._model.size
+        for _ in self._model.modes:
+            Y_s = arb_mat(n, n)
+            for i, j in self._places:
+                Y_s[i, j] = Y_s[j, i] = next(entries)
+            found.append(Y_s)
+        return found
+
+
+def _unit(size: int, i: int, j: int) -> arb_mat:
+    unit = arb_mat(size, size)
+    unit[i, j] = unit[j, i] = 1
+    return unit
