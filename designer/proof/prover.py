@@ -33,6 +33,7 @@ _SLOW = 0.98  # radius
 _SHARES = (1 / 4, 1 / 32)  # of all steps so far that w = Gamma eta is held for
 _FORGOTTEN = 40.0  # e^-40 is left of what there was, after so many times the steps that errors last
 _LARGEST_LEAP = 130  # entries of Y in all modes: a second, if its powers are taken some hundred times
+_LARGEST_LEAP_OFTEN = 60
 _STEPS_OF_OTHERS = 5000  # with a P that is to end it early
 
 
@@ -130,7 +131,8 @@ class Prover:
         if by is None or by.unknowns > _LARGEST_LEAP or not _SLOW < radius < 1.0:
             return None
         most, modes = int(_FORGOTTEN / (1.0 - radius)), self._problem.mode_names
-        known = (disproof_by_leaps(by, modes, gamma, most=most, share=share) for share in _SHARES)
+        shares = _SHARES if by.unknowns <= _LARGEST_LEAP_OFTEN else _SHARES[:1]
+        known = (disproof_by_leaps(by, modes, gamma, most=most, share=share) for share in shares)
         return by.name if any(false is not None for false in known) else None
 
     def at_least_by_steps(self, gamma: float, *, most: int) -> str | None:

@@ -129,7 +129,7 @@ def test_what_is_proved_of_given_gains_is_on_the_ladder(monkeypatch: pytest.Monk
     assert analysis.ladder.gamma == pytest.approx(analysis.ladder.exact[1], rel=1e-6)  # type: ignore[index]
     assert "gamma, certified" in analysis.text()
     assert analysis.document()["unproved"] is None
-    monkeypatch.setattr(Prover, "exact", lambda self, gamma: Verdict(False, gamma, "none", "of the moon", {}))
+    monkeypatch.setattr(Prover, "exact", lambda self, gamma, most=0: Verdict(False, gamma, "none", "of the moon", {}))
     analysis = analyse(problem, given(problem, 2, 0.1))
     assert analysis.ladder.gamma is None
     assert "certified  no gamma: of the moon" in analysis.text()
