@@ -78,7 +78,7 @@ ROOMS = {
     "designer.simulation": "designer.gain designer.model designer.workers",
     "designer.ledger": "designer.gain designer.model designer.proof",
     "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
-    "designer.identify": "designer.gain designer.model designer.replay",
+    "designer.identify": "designer.box designer.gain designer.model designer.replay",
     "designer.report": "designer.beyond_gamma designer.gain designer.ladder designer.model designer.replay "
     "designer.single_run designer.start",
     "designer.compare": "agent.contract.recording",

@@ -12,6 +12,7 @@ from places import ROOT
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.analysis import analyse, load_given
+from designer.box.extent import box_in
 from designer.cli import main
 from designer.problems.notes import notes
 
@@ -24,7 +25,7 @@ def blocks(language: str) -> list[str]:
 
 def test_its_problem_is_a_problem() -> None:
     """The example of a problem file loads, and the example of a refusal is what it says."""
-    text, _ = blocks("toml")
+    text = blocks("toml")[0]
     document = tomllib.loads(text)
     assert Problem.from_document(document).node_names == ("inflow", "level")
     document["node"][0]["C"] = [[1.0]]
@@ -35,13 +36,23 @@ def test_its_problem_is_a_problem() -> None:
 
 def test_its_example_of_a_real_network_is_one() -> None:
     """What it adds to the problem is read, and lets the plant be unstable."""
-    text, added = map(tomllib.loads, blocks("toml"))
+    text, added, _ = map(tomllib.loads, blocks("toml"))
     document = text | {"unbiased": added["unbiased"], "link": added["link"]}
     document["node"][0] |= added["node"][0]
     problem = Problem.from_document(document)
     assert (problem.carries_plant, problem.delivery.tolist()) == (False, [[1.0, 1.0], [0.95, 1.0]])
     document["plant"]["A"][0][0] = 1.02
     Problem.from_document(document)
+
+
+def test_its_tolerances_are_a_box_of_its_problem() -> None:
+    text, _, added = map(tomllib.loads, blocks("toml"))
+    document = text | {"uncertainty": added["uncertainty"]}
+    document["node"][0] |= added["node"][0]
+    box = box_in(Problem.from_document(document))
+    assert box is not None
+    assert (len(box.intervals), [len(rows) for rows in box.rows]) == (1, [2, 2])
+    assert {(entry.matrix, entry.node) for entry in box.entries} == {("A", 0), ("C", 0)}
 
 
 def test_its_problem_has_a_column_of_w_for_each_noise() -> None:

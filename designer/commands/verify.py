@@ -16,6 +16,8 @@ from designer.commands.within import add_within, asked
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
+    from designer.box.robust import Robust
+    from designer.proof.findings import Verdict
 
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
@@ -41,8 +43,6 @@ def add_verify(commands: Subcommands) -> None:
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS [PROBLEM]`."""
-    from designer.box.claim import again
-    from designer.box.robust import robust
     from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
@@ -54,19 +54,15 @@ def verify_command(options: argparse.Namespace) -> int:
     differs = _differences(gains.problem, problem)
     if set(differs) - _BESIDE:
         return _for_another(gains, options, differs)
+    asked(problem, options.within)  # what is no box is refused before anything is proved
     started = time.perf_counter()
     try:
         verdict = verify(gains, makes=BALLS if options.balls else FLOATS + BALLS)
-        claimed = again(gains, balls=options.balls) if verdict.holds else None
+        verdict, in_box = _with_box(verdict, gains, problem, options)
     except InputError as error:
         raise InputError(f"{options.gains}: {error}") from None
-    if claimed is not None and claimed.gamma is None:
-        why = f"as it claims for every model of its box: {claimed.why_not}"
-        verdict = verdict._replace(holds=False, gamma=gains.certificate.box_gamma or 0.0, failure=why)
-    other = options.within or claimed is None or "tolerance" in differs
-    box = asked(problem, options.within) if verdict.holds and other else None
-    in_box = claimed if box is None else robust(gains.problem, gains.K, gains.H, box, balls=options.balls)
-    good = EXIT_GOOD if verdict.holds and (in_box is None or in_box.gamma is not None) else EXIT_NO
+    asked_for = bool(options.within) or "tolerance" in differs
+    good = EXIT_GOOD if verdict.holds and not (asked_for and in_box and in_box.gamma is None) else EXIT_NO
     seconds, claim = time.perf_counter() - started, gains.certificate
     within = "" if in_box is None or in_box.verdict is None else in_box.verdict.arithmetic
     how = "; ".join(dict.fromkeys(part for part in (verdict.arithmetic, within, f"{seconds:.2f} s") if part))
@@ -91,6 +87,25 @@ def verify_command(options: argparse.Namespace) -> int:
         lines = [no, *lines]
     print("\n".join([*lines, f"in      {how}"]))
     return good
+
+
+def _with_box(
+    verdict: Verdict, gains: Gains, problem: Problem, options: argparse.Namespace
+) -> tuple[Verdict, Robust | None]:
+    """What is proved of the box that is asked for, or else of the file's own, of which its claim has to be true."""
+    from designer.box.claim import again
+    from designer.box.robust import robust
+
+    if not verdict.holds:
+        return verdict, None
+    claimed = again(gains, balls=options.balls)
+    if claimed is not None and claimed.gamma is None:
+        why = f"as it claims for every model of its box: {claimed.why_not}"
+        return verdict._replace(holds=False, gamma=gains.certificate.box_gamma or 0.0, failure=why), None
+    if claimed is not None and not options.within and gains.problem == problem:
+        return verdict, claimed
+    box = asked(problem, options.within)
+    return verdict, None if box is None else robust(gains.problem, gains.K, gains.H, box, balls=options.balls)
 
 
 def _differences(found: Problem, wanted: Problem) -> list[str]:

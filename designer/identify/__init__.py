@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, counted
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from designer.box.extent import box_in
 from designer.gain.exact import Gain, exact_gain
 from designer.identify.counts import Counts, counts_of, total
-from designer.identify.estimate import observed
+from designer.identify.estimate import observed, tolerant
 from designer.identify.fit import Finding, findings
 from designer.model.error_model import error_model, stacked_gains
 from designer.model.mismatch import error_model_of
@@ -27,7 +28,8 @@ class Identification(NamedTuple):
     counts: Counts
     findings: tuple[Finding, ...]
     designed: Gain  # the exact gain of the gains as their file has the network
-    problem: Problem | None  # with what was observed; None: there is none, because `refusal`
+    problem: Problem | None  # with what was observed, and tolerances; None: there is none, because `refusal`
+    tolerances: str  # what they are, or why there are none
     refusal: str
     gain: Gain | None  # the exact gain of the same gains there
 
@@ -57,6 +59,7 @@ class Identification(NamedTuple):
             "exact_as_designed": self.designed.bounds,
             "exact_as_observed": self.gain.bounds if self.gain else None,
             "stable_as_observed": self.gain.stable if self.gain else None,
+            "tolerances": self.tolerances,
             "refusal": self.refusal,
         }
 
@@ -69,6 +72,7 @@ class Identification(NamedTuple):
             f"tests      {self.tests} at once, level {self.level:g} in all (Holm)",
             f"intervals  each at {1.0 - self.level:.4g}",
         ]
+        lines += [] if self.problem is None else [f"tolerances {self.tolerances}"]
         lines += [line for finding in self.findings for line in finding.lines()]
         return "\n".join([*lines, f"exact gain {self._gain_text()}"])
 
@@ -93,6 +97,14 @@ def identify(logs: Sequence[Log], *, level: float = 0.01) -> Identification:
         problem = observed(gains.problem, counts)
     except InputError as error:
         refusal = str(error)
+    tolerances = ""
+    if problem is not None:
+        try:
+            wide = tolerant(problem, gains.problem, counts, level=level)
+            box_in(wide)
+            problem = wide
+        except InputError as error:  # more may vary than is looked at
+            tolerances = f"left out: {error}"
     K_bar, H_bar = stacked_gains(gains)
     if problem is not None:
         gain = exact_gain(error_model_of(problem, gains.problem.beta, K_bar, H_bar))
@@ -105,6 +117,7 @@ def identify(logs: Sequence[Log], *, level: float = 0.01) -> Identification:
         findings=tuple(findings(gains.problem, counts, level=level)),
         designed=exact_gain(error_model(gains.problem, K_bar, H_bar)),
         problem=problem,
+        tolerances=tolerances or f"of all probabilities at once, at {1.0 - level:.4g}",
         refusal=refusal,
         gain=gain,
     )

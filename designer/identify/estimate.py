@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from typing import Any
+
 from agent.contract.errors import InputError, counted
 from agent.contract.problem import Problem
-from designer.identify.counts import Counts
+from designer.identify.counts import Count, Counts
+from designer.identify.fit import interval
 
 
 def observed(problem: Problem, counts: Counts) -> Problem:
@@ -31,5 +36,66 @@ def observed(problem: Problem, counts: Counts) -> Problem:
     ]
     changed = document | {"node": nodes, "markov": document["markov"] | {"transition": rows}}
     if rho:
-        changed["link"] = [{"receiver": i, "sender": j, "delivery_probability": share} for (i, j), share in rho.items()]
+        known = {(link["receiver"], link["sender"]): link for link in document.get("link", ())}
+        changed["link"] = [
+            known.get((i, j), {"receiver": i, "sender": j}) | {"delivery_probability": share}
+            for (i, j), share in rho.items()
+        ]
     return Problem.from_document(changed)
+
+
+def tolerant(problem: Problem, assumed: Problem, counts: Counts, *, level: float) -> Problem:
+    """What was `observed` with tolerances that have all true probabilities at once with probability 1 - level at least.
+
+    Each interval has its own with 1 - level / so many (Bonferroni). What is `assumed` never to fail, or never to
+    happen, and did not, is left as certain, and what was never tried as it was. A row of Pi is as far off as the
+    intervals of its entries let it be.
+    """
+    nodes, links = problem.nodes, problem.links or ()
+    rho = assumed.delivery
+    pairs = [(problem.node_index(link.receiver), problem.node_index(link.sender)) for link in links]
+    arrived = {j: count for j, count in enumerate(counts.arrivals) if _may_fail(count, assumed.beta[j])}
+    delivered = {
+        k: counts.deliveries[pair]
+        for k, pair in enumerate(pairs)
+        if pair in counts.deliveries and _may_fail(counts.deliveries[pair], rho[pair])
+    }
+    rows = [
+        [Count(int(hits), int(exits.sum())) for hits, pi in zip(exits, row, strict=True) if pi > 0.0 or hits]
+        for exits, row in zip(counts.transitions, assumed.markov.transition, strict=True)
+    ]
+    rows = [row if row and row[0].trials else [] for row in rows]
+    number = len(arrived) + len(delivered) + sum(len(row) for row in rows if len(row) > 1)
+    if not number:
+        return problem
+    document, each = problem.document(), level / number
+    for j, count in arrived.items():
+        _may_be(document["node"][j], "arrival_probability", nodes[j].arrival_probability, interval(count, each))
+    for k, count in delivered.items():
+        _may_be(document["link"][k], "delivery_probability", links[k].delivery_probability, interval(count, each))
+    if any(len(row) > 1 for row in rows):
+        document["markov"]["tolerance"] = {"transition": [_total_variation(row, each) for row in rows]}
+    return Problem.from_document(document)
+
+
+def _may_fail(count: Count, assumed: float) -> bool:
+    return count.trials > 0 and (assumed < 1.0 or count.hits < count.trials)
+
+
+def _may_be(part: dict[str, Any], name: str, value: float, ends: tuple[float, float]) -> None:
+    sides = [_above(value - ends[0]), _above(ends[1] - value)]
+    part["tolerance"] = part.get("tolerance", {}) | {name: sides}
+
+
+def _total_variation(row: Sequence[Count], level: float) -> float:
+    """Half of sum |pi - p| is the sum of what some entries gain, and of what others lose."""
+    if len(row) < 2:
+        return 0.0
+    ends = [(count.share, *interval(count, level)) for count in row]
+    gained, lost = sum(high - share for share, _, high in ends), sum(share - low for share, low, _ in ends)
+    return min(_above(min(gained, lost)), 1.0)
+
+
+def _above(size: float) -> float:
+    """Six decimals, rounded up."""
+    return math.ceil(size * 1e6) / 1e6

@@ -117,3 +117,18 @@ def test_verify_proves_the_box_of_the_problem_that_it_is_given(
     wider = json.loads(capsys.readouterr().out)
     assert wider["within"]["intervals"] == [['arrival at node "a"', pytest.approx(0.84), pytest.approx(0.96)]]
     assert main(["verify", str(edited(tmp_path)), str(problem), "--set", "node.a.arrival_probability=0.8"]) == 1
+
+
+def test_a_box_of_which_nothing_is_claimed_is_looked_at_and_fails_only_who_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """0.8 and 30 % of it are unstable, which does not make the nominal gamma false."""
+    problem = scalar(uncertainty={"A": "30%"}, plant={"A": [[0.8]], "B": [[1.0, 0.0]], "M": [[1.0]]})
+    document = json.loads(claimed().canonical())
+    document |= {"problem": problem.document(), "problem_digest": problem.digest()}
+    del document["certificate"]["box"]
+    path = tmp_path / "gains.json"
+    path.write_text(json.dumps(document))
+    assert main(["verify", str(path)]) == 0
+    assert "no gamma is proved for the box" in capsys.readouterr().out
+    assert main(["verify", str(path), "--within", "A=30%"]) == 1

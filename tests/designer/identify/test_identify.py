@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from places import ROOT
 from agent.contract.errors import EXIT_GOOD, EXIT_INPUT, EXIT_NO
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from designer.box.extent import box_in
 from designer.cli import main
 from designer.identify.counts import Count, Counts, counts_of, total
-from designer.identify.estimate import observed
+from designer.identify.estimate import observed, tolerant
 from designer.identify.fit import Finding, findings, interval, likelihood_ratio
 from designer.problems import find, names
 from designer.problems.written import to_toml
@@ -241,3 +243,46 @@ def test_the_gain_as_observed_is_that_of_filters_with_the_old_beta(capsys: pytes
     low, high = found["exact_as_designed"]
     assert low < high < gains.certificate.gamma
     assert found["exact_as_observed"][1] != pytest.approx(high, rel=1e-3)
+
+
+def inside(problem: Problem, truth: Problem) -> bool:
+    """Whether all true probabilities are within the tolerances of the problem, by their own definition."""
+    box = box_in(problem)
+    assert box is not None
+    ends = {(part.matrix, part.at): (part.low, part.high) for part in box.intervals}
+    assert len(ends) == (truth.beta < 1.0).sum() + (truth.delivery < 1.0).sum()
+    within = [
+        low <= (truth.beta if matrix == "beta" else truth.delivery)[at] <= high
+        for (matrix, at), (low, high) in ends.items()
+    ]
+    assert problem.markov.tolerance is not None
+    far = np.abs(problem.markov.transition - truth.markov.transition).sum(axis=1) / 2.0
+    return all(within) and bool((far <= problem.markov.tolerance.transition).all())
+
+
+def test_tolerances_have_all_true_probabilities_at_once_as_often_as_they_say() -> None:
+    """At 1 - level or more; and they are not so wide that a wrong truth is in them."""
+    every = drawn(PROBLEM, logs=120, steps=400, seed=5)
+    found = [tolerant(observed(PROBLEM, counts), PROBLEM, counts, level=LEVEL) for counts in every]
+    assert sum(not inside(problem, PROBLEM) for problem in found) <= 12 + 3 * math.sqrt(120 * 0.1 * 0.9)
+    wrong = with_(PROBLEM, beta=0.3)
+    assert not any(inside(problem, wrong) for problem in found)
+
+
+def test_the_problem_that_is_written_is_a_box_around_what_was_observed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """So that the next command designs for it."""
+    run, path = made(tmp_path / "run.mcap", truth=PROBLEM, steps=200), tmp_path / "new.toml"
+    assert main(["identify", str(run), "-o", str(path)]) == EXIT_GOOD
+    assert "tolerances of all probabilities at once, at 0.99" in capsys.readouterr().out
+    problem = Problem.load(path)
+    assert inside(problem, problem)
+
+
+def test_tolerances_that_are_each_at_the_level_miss_the_truth_more_often() -> None:
+    """The mutant without Bonferroni."""
+    every = drawn(PROBLEM, logs=120, steps=400, seed=5)
+    number = 14  # about what it divides by
+    found = [tolerant(observed(PROBLEM, counts), PROBLEM, counts, level=LEVEL * number) for counts in every]
+    assert sum(not inside(problem, PROBLEM) for problem in found) > 12 + 3 * math.sqrt(120 * 0.1 * 0.9)
