@@ -19,6 +19,7 @@ from designer.proof.ball_model import Truth
 
 _WIDTH = 1e-5  # of gamma^2: models are compared by that
 _ROUNDS = 3
+_FEW_ENTRIES = 30  # of more, signs are not tried again together
 
 
 class Worst(NamedTuple):
@@ -76,7 +77,8 @@ def _ascent(
 
 
 def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst:
-    """Probabilities and rows first, with the matrices of the file; then each entry's sign alone; then all again."""
+    """Probabilities and rows first, with the matrices of the file; then each entry's sign alone; then all again,
+    where there are few entries."""
     split, last = len(box.intervals), len(box.intervals) + len(box.rows)
     choices: list[list[int]] = [[0, 1]] * split + [list(range(len(rows))) for rows in box.rows]
     choices += [[-1, 1]] * len(box.entries)
@@ -93,5 +95,7 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
     if box.entries and math.isfinite(most):
         up = [gain_at([*at[:place], 1, *at[place + 1 :]]) for place in range(last, len(at))]
         at = at[:last] + [1 if gain >= most else -1 for gain in up]
-        at, most = _ascent(gain_at, at, gain_at(at), choices)
+        most = gain_at(at)
+        if len(box.entries) <= _FEW_ENTRIES:
+            at, most = _ascent(gain_at, at, most, choices)
     return Worst(truth(at), most, tuple(bool(k) for k in at[:split]), tuple(at[split:last]), tuple(at[last:]))
