@@ -36,10 +36,14 @@ class Worst(NamedTuple):
 
 def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
     """Its error model in floats, with filters as the problem has them."""
-    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
-    real = Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
     carry = truth.carry or problem.carries_plant
-    return real_error_model(problem, problem.beta, real, *stacked_links(problem, K, H), carry=carry)
+    return real_error_model(problem, problem.beta, real(problem, truth), *stacked_links(problem, K, H), carry=carry)
+
+
+def real(problem: Problem, truth: Truth) -> Real:
+    """The same in floats."""
+    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
+    return Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
 
 
 def problem_at(problem: Problem, truth: Truth) -> Problem:

@@ -22,14 +22,13 @@ from designer.box import design as designing
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box, box_in, box_of, corners, within
 from designer.box.robust import robust
-from designer.box.worst import problem_at
+from designer.box.worst import real, real_model
 from designer.cli import main
 from designer.commands.design import design_text
 from designer.gain.exact import exact_gain
 from designer.ladder import NOMINAL, NOMINAL_IN_BOX
-from designer.model.error_model import stacked_links
-from designer.model.mismatch import error_model_of
 from designer.problems import text_of
+from designer.proof.ball_model import told
 from designer.ranking import Rank, table
 from designer.search.descent import Budget, Progress
 from designer.synthesis import design, design_in_box
@@ -80,10 +79,8 @@ def gamma_of(gains: Gains, box: Box) -> float:
 
 def worst_of(gains: Gains, box: Box) -> float:
     """The largest exact gain of all corners."""
-    problem = gains.problem
-    models = [problem_at(problem, corner) for corner in corners(problem, box)]
-    stacked = stacked_links(problem, gains.K, gains.H)
-    return max(exact_gain(error_model_of(model, problem.beta, *stacked)).high for model in models)
+    models = (real_model(gains.problem, gains.K, gains.H, corner) for corner in corners(gains.problem, box))
+    return max(exact_gain(model).high for model in models)
 
 
 class Pendulum(NamedTuple):
@@ -167,7 +164,7 @@ def test_gains_are_ranked_by_what_is_proved_for_the_box(
 def test_a_descent_that_ignores_the_box_is_not_as_good(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes down for the nominal model once for every corner; what that gives is proved, and far above."""
     good = honest()
-    monkeypatch.setattr(designing, "problem_at", lambda problem, truth: problem)
+    monkeypatch.setattr(designing, "real", lambda problem, truth: real(problem, told(problem)))
     mutant = for_box()
     assert good.robust.gamma is not None
     assert good.robust.gamma < 0.98 * gamma_of(mutant.gains, box())
