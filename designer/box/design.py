@@ -156,7 +156,7 @@ class _Search:
         self.barrier = Barrier(self.natural.problem, _HORIZON)
         self.longest = longest_horizon(problem)
         there = self.natural.there(start.K, start.H)
-        self.v = self.barrier.entries.pack(*stacked_links(self.natural.problem, *there))
+        self.v = self.begin = self.barrier.entries.pack(*stacked_links(self.natural.problem, *there))
         self.is_proved, self.steps = True, 0  # whether v was looked at; how many came before
         self.met: set[tuple[tuple[int, ...], ...]] = set()  # corners
         self.least = math.inf if before.gamma is None else before.gamma
@@ -227,6 +227,8 @@ class _Search:
             return True
         if found.gain > gamma * (1.0 + _SHORT) and 2 * self.barrier.horizon <= self.longest:
             self.barrier.horizon *= 2
+            if math.isinf(found.gain):  # gamma_T leads to gains that are not stable, too
+                self.v = self.begin
             return True
         return False
 
