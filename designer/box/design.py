@@ -188,7 +188,7 @@ class _Search:
             while self.meet(self.follow(mu), most=most):
                 self.budget.check()
             gamma = self.prove()
-            if math.isfinite(last) and not gamma < last * (1.0 - _BETTER):
+            if self.best is not None and not gamma < last * (1.0 - _BETTER):
                 break
             last = gamma
 
