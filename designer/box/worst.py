@@ -46,22 +46,6 @@ def real(problem: Problem, truth: Truth) -> Real:
     return Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
 
 
-def problem_at(problem: Problem, truth: Truth) -> Problem:
-    """The problem whose file says these probabilities. 0 and 1 are nearly that: a file has none of the former."""
-    document = problem.document()
-    for j, node in enumerate(document["node"]):
-        node["arrival_probability"] = truth.beta[j] if truth.beta[j] == problem.beta[j] else _inside(truth.beta[j])
-    for link in document.get("link", []):
-        at = problem.node_index(link["receiver"]), problem.node_index(link["sender"])
-        link["delivery_probability"] = max(float(truth.rho[at]), _inside(0.0))
-    document["markov"]["transition"] = [[float(pi) for pi in row] for row in truth.transition]
-    return Problem.from_document(document)
-
-
-def _inside(probability: float) -> float:
-    return min(max(float(probability), float(np.finfo(float).tiny)), 1.0 - 2.0**-53)
-
-
 def _ascent(
     gain_at: Callable[[list[int]], float], at: list[int], most: float, choices: list[list[int]]
 ) -> tuple[list[int], float]:
