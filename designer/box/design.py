@@ -34,7 +34,7 @@ from designer.search.barrier import Barrier
 from designer.search.descent import Budget, Progress, TimeIsUp, longest_horizon
 from designer.search.exact_design import certify
 
-_WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5)  # mu
+_WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5)  # mu
 _ROUNDS = 3  # for each mu: models that join
 _MOST_MODELS = 12
 _HORIZON = 20

@@ -261,8 +261,8 @@ def test_matrices_that_are_uncertain_are_designed_for(pendulum: Pendulum, monkey
 @pytest.mark.parametrize("texts", [["probabilities=0.1"], ["A,B,C,D,M=0.3%"]])
 def test_other_units_give_the_same_gains(texts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """States, measurements and z in other powers of two: every bit that the search goes through is as it was."""
-    monkeypatch.setattr(designing, "robust", lambda *_: before)  # proofs are those of the units that they are for
     before = honest().before
+    monkeypatch.setattr(designing, "robust", lambda *_: before)  # proofs are those of the units that they are for
     x, y, document = np.array([2.0**9, 2.0**-7])[: nominal().problem.nx], 2.0**5, nominal().problem.document()
     plant, rows = nominal().problem.plant, x[:, None]
     document["plant"] |= {
