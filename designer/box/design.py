@@ -19,21 +19,22 @@ import numpy as np
 from agent.contract.errors import Unattainable, counted
 from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.box.extent import Box, truth_at
+from designer.box.extent import Box
 from designer.box.robust import Robust, robust
-from designer.box.worst import problem_at, worst
+from designer.box.worst import real, worst
 from designer.gain.exact import Operator, horizon_gain
 from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
 from designer.ladder import Ladder, percent
 from designer.model.error_model import link_gains, stacked_links
 from designer.model.units import NaturalUnits
+from designer.proof.deviations import Entry
 from designer.search import bfgs
 from designer.search.barrier import Barrier
 from designer.search.descent import Budget, Progress, TimeIsUp, longest_horizon
 from designer.search.exact_design import certify
 
-_WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5)  # mu
+_WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5)  # mu
 _ROUNDS = 3  # for each mu: models that join
 _MOST_MODELS = 12
 _HORIZON = 20
@@ -105,8 +106,6 @@ def design_for_box(
         before, search = robust(problem, nominal.K, nominal.H, box), False
     if nominal.method != "exact":
         return ForBox(nominal, before, nominal, before, f"method {nominal.method} does not design for a box")
-    if box.corners == 1:
-        return ForBox(nominal, before, nominal, before, "what may be off A, B, C, D and M is not designed for")
     if not search:
         return ForBox(nominal, before, nominal, before, "interrupted, nothing else was tried")
     descent = _Search(problem, box, nominal, before, Budget() if budget is None else budget, progress)
@@ -151,15 +150,15 @@ class _Search:
         budget: Budget,
         progress: Callable[[Progress], None] | None,
     ) -> None:
-        self.problem, self.whole, self.budget, self.progress = problem, box, budget, progress
-        self.box = box._replace(entries=())  # in which the worst are sought: entries have the units of the problem
+        self.problem, self.box, self.budget, self.progress = problem, box, budget, progress
         self.natural = NaturalUnits(problem)
+        self.natural_box = box._replace(entries=tuple(_scaled(entry, self.natural) for entry in box.entries))
         self.barrier = Barrier(self.natural.problem, _HORIZON)
         self.longest = longest_horizon(problem)
         there = self.natural.there(start.K, start.H)
-        self.v = self.barrier.entries.pack(*stacked_links(self.natural.problem, *there))
+        self.v = self.begin = self.barrier.entries.pack(*stacked_links(self.natural.problem, *there))
         self.is_proved, self.steps = True, 0  # whether v was looked at; how many came before
-        self.met: set[tuple[tuple[bool, ...], tuple[int, ...]]] = set()  # corners
+        self.met: set[tuple[tuple[int, ...], ...]] = set()  # corners
         self.least = math.inf if before.gamma is None else before.gamma
         self.best: tuple[LinkMatrices, LinkMatrices, Robust] | None = None  # that has this gamma, if it is not `before`
 
@@ -189,7 +188,7 @@ class _Search:
             while self.meet(self.follow(mu), most=most):
                 self.budget.check()
             gamma = self.prove()
-            if math.isfinite(last) and not gamma < last * (1.0 - _BETTER):
+            if self.best is not None and not gamma < last * (1.0 - _BETTER):
                 break
             last = gamma
 
@@ -217,26 +216,45 @@ class _Search:
     def meet(self, gamma: float, *, most: int) -> bool:
         """Whether there is more to do on this weight: one corner more, up to so many, or a horizon twice as long."""
         problem, gains = self.natural.problem, self.barrier.entries.unpack(self.v)
-        found = worst(problem, *link_gains(problem, *gains), self.box)
-        corner, gain = (found.ends, found.rows), found.gain
+        found = worst(problem, *link_gains(problem, *gains), self.natural_box)
+        corner = found.ends, found.rows, found.signs
         if corner not in self.met:
             if len(self.met) == most:
                 return False
             self.met.add(corner)
-            truth = problem_at(problem, truth_at(problem, self.box, *corner))
-            self.barrier.models.append(Inputs(truth, problem.beta))
+            carry = self.box.carry or problem.carries_plant
+            self.barrier.models.append(Inputs(problem, real(problem, found.truth), carry=carry))
             return True
-        if gain > gamma * (1.0 + _SHORT) and 2 * self.barrier.horizon <= self.longest:
+        if found.gain > gamma * (1.0 + _SHORT) and 2 * self.barrier.horizon <= self.longest:
             self.barrier.horizon *= 2
+            if math.isinf(found.gain):  # gamma_T leads to gains that are not stable, too
+                self.v = self.begin
             return True
         return False
 
     def prove(self) -> float:
         """Gamma of v for the box, infinite where none is proved; kept, if it is the least."""
         K, H = self.natural.back(*link_gains(self.natural.problem, *self.barrier.entries.unpack(self.v)))
-        found = robust(self.problem, K, H, self.whole)
+        found = robust(self.problem, K, H, self.box)
         self.is_proved = True
         gamma = math.inf if found.gamma is None else found.gamma
         if gamma < self.least:
             self.least, self.best = gamma, (K, H, found)
         return gamma
+
+
+def _scaled(entry: Entry, units: NaturalUnits) -> Entry:
+    """An entry of the same matrix in these units."""
+    r, c, x, y = entry.row, entry.column, units.state, units.y[entry.node]
+    match entry.matrix:
+        case "A":
+            by = x[c] / x[r]
+        case "B":
+            by = 1.0 / x[r]
+        case "M":
+            by = x[c] / units.output
+        case "C":
+            by = x[c] / y[r]
+        case _:
+            by = 1.0 / y[r]
+    return entry._replace(radius=entry.radius * float(by))

@@ -37,26 +37,14 @@ class Worst(NamedTuple):
 
 def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
     """Its error model in floats, with filters as the problem has them."""
-    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
-    real = Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
     carry = truth.carry or problem.carries_plant
-    return real_error_model(problem, problem.beta, real, *stacked_links(problem, K, H), carry=carry)
+    return real_error_model(problem, problem.beta, real(problem, truth), *stacked_links(problem, K, H), carry=carry)
 
 
-def problem_at(problem: Problem, truth: Truth) -> Problem:
-    """The problem whose file says these probabilities. 0 and 1 are nearly that: a file has none of the former."""
-    document = problem.document()
-    for j, node in enumerate(document["node"]):
-        node["arrival_probability"] = truth.beta[j] if truth.beta[j] == problem.beta[j] else _inside(truth.beta[j])
-    for link in document.get("link", []):
-        at = problem.node_index(link["receiver"]), problem.node_index(link["sender"])
-        link["delivery_probability"] = max(float(truth.rho[at]), _inside(0.0))
-    document["markov"]["transition"] = [[float(pi) for pi in row] for row in truth.transition]
-    return Problem.from_document(document)
-
-
-def _inside(probability: float) -> float:
-    return min(max(float(probability), float(np.finfo(float).tiny)), 1.0 - 2.0**-53)
+def real(problem: Problem, truth: Truth) -> Real:
+    """The same in floats."""
+    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
+    return Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
 
 
 def _ascent(

@@ -19,7 +19,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator, horizon_gain, recursion_holds, step
 from designer.gain.products import Collected, Pattern
 from designer.model.error_model import ErrorModel, Indices, LinkTerms, error_model, stacks
-from designer.model.mismatch import error_model_of
+from designer.model.mismatch import Innovation, Real, real_error_model
 
 
 class Sweep(NamedTuple):
@@ -58,17 +58,19 @@ class Slope(NamedTuple):
 class Inputs:
     """What the gains multiply in (6)-(11), so that a derivative by the error model becomes one by the gains.
 
-    `told` (n,): the arrival probabilities that the filters use, where those of the problem are others.
+    `real`: what is, where that is not what the filters were told; then `carry` says whether x is in eta, as
+    `real_error_model` takes it.
     """
 
-    def __init__(self, problem: Problem, told: Array | None = None) -> None:
+    def __init__(self, problem: Problem, real: Real | None = None, *, carry: bool = False) -> None:
         bar, nx = stacks(problem), problem.nx
-        self.problem, self.bar, self.rho = problem, bar, problem.delivery
-        self.told, self.p = problem.beta if told is None else told, problem.plant_states
-        off = np.where([node.seen for node in problem.nodes], 0.0, problem.beta - self.told)
-        of_row = np.repeat(off, [len(node.C) for node in problem.nodes])[:, None]
-        self.C_e = bar.C_beta - of_row * bar.C  # c_j C_j of every node, or beta_j C_j where it sees its losses
-        self.C_x = of_row * np.vstack([node.C for node in problem.nodes])[:, : self.p] if off.any() else None
+        self.problem, self.real, self.bar = problem, real, bar
+        self.by_e, self.by_w, self.by_x = bar.C_beta, bar.D_beta, None  # the mean innovations
+        self.p, self.rho = problem.plant_states, problem.delivery
+        if real is not None:
+            self.p, self.rho = nx if carry else 0, real.rho
+            mean = Innovation(problem, problem.beta, real, self.p)
+            self.by_e, self.by_w, self.by_x = mean.by_e, mean.by_w, mean.by_x[:, : self.p]
         self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
         widths = [len(node.C) for node in problem.nodes]
         self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)
@@ -86,24 +88,26 @@ class Inputs:
 
     def model(self, K_bar: Array, H_bar: Array) -> ErrorModel:
         """The error model of these gains."""
-        return error_model_of(self.problem, self.told, K_bar, H_bar)
+        if self.real is None:
+            return error_model(self.problem, K_bar, H_bar)
+        return real_error_model(self.problem, self.problem.beta, self.real, K_bar, H_bar, carry=self.p > 0)
 
     def gains(self, model: ErrorModel, AB: Array, lossy: Array, V: Array | None) -> tuple[Array, Array]:
         """Derivatives by K_bar and H_bar, from those by the rows of e in [A B], by H of `lossy` and by V of the links.
 
         K_ij stands in columns x, e_j (times rho_ij) and e_i (times 1 - rho_ij); H_ij in those of e_j and w, and in
-        those of x where the filters are told something else.
+        those of x where what is real is something else.
         """
-        p, n, nx, bar = self.p, self.problem.n, self.problem.nx, self.bar
+        p, n, nx = self.p, self.problem.n, self.problem.nx
         modes, x, e, w = len(AB), AB[:, :, :p], AB[:, :, p : p + n * nx], AB[:, :, p + n * nx :]
         own = np.stack([e[:, i * nx : (i + 1) * nx, i * nx : (i + 1) * nx] for i in range(n)], axis=1)
         every = np.tile(own.reshape(modes, n * nx, nx), (1, 1, n))
         K = self.rho_K * e + (1.0 - self.rho_K) * every
         if not self.problem.unbiased:
             K -= np.tile(x, (1, 1, n))
-        H = lossy - e @ self.C_e.T - w @ bar.D_beta.T
-        if self.C_x is not None:
-            H -= x @ self.C_x.T
+        H = lossy - e @ self.by_e.T - w @ self.by_w.T
+        if self.by_x is not None:
+            H -= x @ self.by_x.T
         H *= self.rho_H
         if V is not None and model.links is not None:
             self._add_links(model.links, model.R, V, K, H)
@@ -118,10 +122,10 @@ class Inputs:
                 continue
             e_i, e_j, w = V[term, :, p : p + nx], V[term, :, p + nx : p + 2 * nx], V[term, :, p + 2 * nx :]
             K[s, rows, j * nx : (j + 1) * nx] += e_j - e_i
-            C_j = self.C_e[columns, j * nx : (j + 1) * nx]
-            H[s, rows, columns] -= e_j @ C_j.T + w @ bar.D_beta[columns].T
-            if self.C_x is not None:
-                H[s, rows, columns] -= V[term, :, :p] @ self.C_x[columns].T
+            by_e = self.by_e[columns, j * nx : (j + 1) * nx]
+            H[s, rows, columns] -= e_j @ by_e.T + w @ self.by_w[columns].T
+            if self.by_x is not None:
+                H[s, rows, columns] -= V[term, :, :p] @ self.by_x[columns].T
 
 
 def slope(

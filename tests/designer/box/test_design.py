@@ -22,14 +22,13 @@ from designer.box import design as designing
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box, box_in, box_of, corners, within
 from designer.box.robust import robust
-from designer.box.worst import problem_at
+from designer.box.worst import real, real_model
 from designer.cli import main
 from designer.commands.design import design_text
 from designer.gain.exact import exact_gain
 from designer.ladder import NOMINAL, NOMINAL_IN_BOX
-from designer.model.error_model import stacked_links
-from designer.model.mismatch import error_model_of
 from designer.problems import text_of
+from designer.proof.ball_model import told
 from designer.ranking import Rank, table
 from designer.search.descent import Budget, Progress
 from designer.synthesis import design, design_in_box
@@ -80,10 +79,8 @@ def gamma_of(gains: Gains, box: Box) -> float:
 
 def worst_of(gains: Gains, box: Box) -> float:
     """The largest exact gain of all corners."""
-    problem = gains.problem
-    models = [problem_at(problem, corner) for corner in corners(problem, box)]
-    stacked = stacked_links(problem, gains.K, gains.H)
-    return max(exact_gain(error_model_of(model, problem.beta, *stacked)).high for model in models)
+    models = (real_model(gains.problem, gains.K, gains.H, corner) for corner in corners(gains.problem, box))
+    return max(exact_gain(model).high for model in models)
 
 
 class Pendulum(NamedTuple):
@@ -167,7 +164,7 @@ def test_gains_are_ranked_by_what_is_proved_for_the_box(
 def test_a_descent_that_ignores_the_box_is_not_as_good(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes down for the nominal model once for every corner; what that gives is proved, and far above."""
     good = honest()
-    monkeypatch.setattr(designing, "problem_at", lambda problem, truth: problem)
+    monkeypatch.setattr(designing, "real", lambda problem, truth: real(problem, told(problem)))
     mutant = for_box()
     assert good.robust.gamma is not None
     assert good.robust.gamma < 0.98 * gamma_of(mutant.gains, box())
@@ -250,8 +247,22 @@ def test_a_horizon_that_is_too_short_is_doubled(monkeypatch: pytest.MonkeyPatch)
     assert (horizons[0], horizons[-1] >= 8) == (2, True)
 
 
-def test_other_units_give_the_same_gains() -> None:
-    """States, measurements and z in other powers of two: every bit of the gains is as it was."""
+def test_matrices_that_are_uncertain_are_designed_for(pendulum: Pendulum, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(designing, "_WEIGHTS", (9e-5,))
+    gains = pendulum.nominal
+    found = design_for_box(gains.problem, box_of(gains.problem, within(["B,D=1%"])), gains)
+    assert any(found.robust.worst.signs)
+    assert found.before.gamma is not None
+    assert found.robust.gamma is not None
+    assert found.robust.found < found.robust.gamma < found.before.gamma
+    assert found.robust.found < found.before.found
+
+
+@pytest.mark.parametrize("texts", [["probabilities=0.1"], ["A,B,C,D,M=0.3%"]])
+def test_other_units_give_the_same_gains(texts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """States, measurements and z in other powers of two: every bit that the search goes through is as it was."""
+    before = honest().before
+    monkeypatch.setattr(designing, "robust", lambda *_: before)  # proofs are those of the units that they are for
     x, y, document = np.array([2.0**9, 2.0**-7])[: nominal().problem.nx], 2.0**5, nominal().problem.document()
     plant, rows = nominal().problem.plant, x[:, None]
     document["plant"] |= {
@@ -271,12 +282,15 @@ def test_other_units_give_the_same_gains() -> None:
         for s, of_s in nominal().H.items()
     }
     there = nominal().model_copy(update={"problem": problem, "problem_digest": problem.digest(), "K": K, "H": H})
-    found = briefly(problem, box_of(problem, within(["probabilities=0.1"])), there)
-    for s, of_s in honest().gains.K.items():
-        for i, of_i in of_s.items():
-            for j, K_ij in of_i.items():
-                np.testing.assert_array_equal(found.gains.K[s][i][j] * rows / x, K_ij)
-                np.testing.assert_array_equal(found.gains.H[s][i][j] * rows / y, honest().gains.H[s][i][j])
+    monkeypatch.setattr(designing, "_WEIGHTS", (3e-3,))
+    here, other = (
+        designing._Search(gains.problem, box_of(gains.problem, within(texts)), gains, before, Budget(), None)
+        for gains in (nominal(), there)
+    )
+    assert here.run() == other.run() == "converged"
+    assert here.met == other.met
+    assert not np.array_equal(here.v, here.begin)
+    np.testing.assert_array_equal(here.v, other.v)
 
 
 @pytest.mark.parametrize(

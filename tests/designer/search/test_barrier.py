@@ -10,9 +10,11 @@ from networks import random_gains, random_problem, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from agent.contract.problem.matrices import Matrices, matrices_of
 from designer.gain.exact import exact_gain
 from designer.gain.sensitivity import Inputs, slope, sweep
 from designer.model.error_model import error_model
+from designer.model.mismatch import Real
 from designer.model.units import natural_units
 from designer.search.barrier import Barrier
 from designer.search.entries import Entries
@@ -39,19 +41,22 @@ def test_the_gradients_of_all_barriers_agree_with_differences(problem: Problem) 
 
 
 def others(problem: Problem, seed: int) -> Inputs:
-    """The same network with other probabilities, which its filters are not told."""
-    rng, document = np.random.default_rng(seed), problem.document()
-    for node in document["node"]:
-        node["arrival_probability"] = float(rng.uniform(0.3, 0.9))
-    for link in document.get("link", []):
-        link["delivery_probability"] = float(rng.uniform(0.3, 0.9))
-    document["markov"]["transition"] = rng.dirichlet(np.ones(len(problem.topologies)), len(problem.topologies)).tolist()
-    return Inputs(Problem.from_document(document), problem.beta)
+    """The same network with other probabilities and matrices, of which its filters are not told."""
+    rng, n, modes = np.random.default_rng(seed), problem.n, len(problem.topologies)
+    rho = np.where(problem.delivery < 1.0, rng.uniform(0.3, 0.9, (n, n)), 1.0)
+
+    def off(matrix: Array) -> Array:
+        return matrix * rng.uniform(0.9, 1.1, matrix.shape)
+
+    A, B, M, C, D = matrices_of(problem)
+    matrices = Matrices(off(A), off(B), off(M), tuple(map(off, C)), tuple(map(off, D)))
+    real = Real(rng.uniform(0.3, 0.9, n), rho, rng.dirichlet(np.ones(modes), modes), matrices)
+    return Inputs(problem, real, carry=True)
 
 
 @pytest.mark.parametrize("problem", PROBLEMS, ids=["paper 1", "paper 2", *real_networks(3)])
 def test_the_gradient_of_several_models_agrees_with_differences(problem: Problem) -> None:
-    """Whose losses, deliveries and switching are others than the filters were told."""
+    """Whose numbers are others than the filters were told; x may be in the errors of these alone."""
     barrier = Barrier(problem, 9, [others(problem, seed) for seed in (0, 1)])
     v = barrier.entries.pack(
         *(least_variance_gains(problem) if problem.unbiased else random_gains(problem, 1, size=0.1))
