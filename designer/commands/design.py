@@ -169,7 +169,7 @@ def design_and_save(
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
     with stoppable() as search:
-        tell = _descent_progress()
+        tell = _descent_progress(budget)
 
         def progress(at: Progress) -> None:
             search.over |= at.over and box is None  # else the search on the worst models follows
@@ -269,8 +269,10 @@ def design_text(result: dict[str, Any]) -> str:
     )
 
 
-def _descent_progress() -> Callable[[Progress], None]:
-    """Prints where the descent is, every other second, and what comes after it where that may take long."""
+def _descent_progress(budget: float) -> Callable[[Progress], None]:
+    """Prints every other second how much of the descent is done and what is in hand, and what comes after it."""
+    from designer.search.effort import in_words
+
     shown = 0.0
 
     def show(progress: Progress) -> None:
@@ -288,7 +290,9 @@ def _descent_progress() -> Callable[[Progress], None]:
                 else f"{counted(progress.steps, 'change')} on: noise over {progress.horizon} steps < "
                 f"{progress.noise:.6g}, gamma < {progress.gamma:.6g}"
             )
-            print(f"{progress.seconds:5.0f} s  {so_far}; Ctrl-C keeps the best so far", file=sys.stderr)
+            done = f"{progress.seconds:5.0f} s of {in_words(budget)} at most"
+            rounds = f", round {progress.round} of {progress.rounds}" if progress.rounds else ""
+            print(f"{done}{rounds}, {so_far}; Ctrl-C keeps the best so far", file=sys.stderr)
 
     return show
 

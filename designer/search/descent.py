@@ -58,6 +58,8 @@ class Progress(NamedTuple):
     noise: float | None = None  # E|z_tilde|^2 in hand, where that is what falls
     phase: str | None = None  # what goes on in place of a search
     over: bool = False  # no search comes after it
+    round: int = 1  # of `rounds`, one for each mu; some are gone through again over a longer horizon
+    rounds: int = 0  # 0: not told
 
 
 class Candidate(NamedTuple):
@@ -275,8 +277,9 @@ class _Search:
             if self.best is None or x[-1] < self.best[-1]:
                 self.best = x
             if self.progress is not None:
-                gamma = math.exp(x[-1] / 2.0)
-                self.progress(Progress(self.start, mu, self.steps, gamma, self.budget.spent, self.barrier.horizon))
+                gamma, horizon = math.exp(x[-1] / 2.0), self.barrier.horizon
+                at = Progress(self.start, mu, self.steps, gamma, self.budget.spent, horizon)
+                self.progress(at._replace(round=_WEIGHTS.index(mu) + 1, rounds=len(_WEIGHTS)))
 
         # L-BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
         inverse_hessian = self.barrier.inverse_hessian(x, mu)

@@ -144,4 +144,5 @@ class _Search:
     def _tell(self, mu: float, value: float) -> None:
         if self.progress is not None:
             noise, horizon = float(np.exp(value)), self.barrier.horizon
-            self.progress(Progress("", mu, self.steps, self.gamma, self.budget.spent, horizon, noise))
+            at = Progress("", mu, self.steps, self.gamma, self.budget.spent, horizon, noise)
+            self.progress(at._replace(round=_WEIGHTS.index(mu) + 1, rounds=len(_WEIGHTS)))

@@ -12,9 +12,12 @@ from places import ROOT
 
 from agent.contract.gains import Gains
 from designer.cli import main
-from designer.problems import names
+from designer.commands import design as design_command
+from designer.problems import find, names
 from designer.reproduce import EXAMPLES, Reproduced
 from designer.search import effort, windows
+from designer.search.descent import Progress, descend
+from designer.search.starts import least_variance_gains
 from designer.synthesis import methods
 
 
@@ -369,3 +372,19 @@ def test_golden_recording(capsys: pytest.CaptureFixture[str]) -> None:
     verdict = json.loads(capsys.readouterr().out)
     assert (verdict["agrees"], verdict["finished"], verdict["steps"], verdict["missing"]) == (True, True, 60, 0)
     assert run("verify", ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json") == 0
+
+
+def test_the_progress_of_a_design_says_how_much_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every other second of the search: its time and what it may take, its round of how many."""
+    told: list[Progress] = []
+    descend(two := find("two-nodes"), {"start": least_variance_gains(two)}, progress=told.append)
+    told = [progress for progress in told if progress.phase is None]
+    assert [progress.round for progress in told] == sorted(progress.round for progress in told)
+    assert {progress.rounds for progress in told} == {told[-1].round}  # it has come to the last one
+    show = design_command._descent_progress(600.0)
+    for seconds in (1.0, 2.5, 3.0, 4.5):
+        show(told[-1]._replace(seconds=seconds))
+    said = capsys.readouterr().err.splitlines()
+    assert [line.split(" at most, ")[0].strip() for line in said] == ["2 s of 10 minutes", "4 s of 10 minutes"]
+    assert f"round {told[-1].round} of {told[-1].rounds}, from start, " in said[0]
+    assert said[0].endswith("; Ctrl-C keeps the best so far")
