@@ -7,10 +7,12 @@ import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple
 
 from agent.commands.options import Subcommands, add_command, load_gains, positive
-from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, listed
+from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError, Interrupted, listed
+from agent.signals import heed, restore
 
 if TYPE_CHECKING:
     from agent.conform.series import Result, Try
@@ -70,16 +72,26 @@ def conform_command(options: argparse.Namespace) -> int:
     if not options.program:
         raise InputError("there is no command to try: peakmesh conform -- ./my_node")
     results: list[Result] = []
-    for result in _results(options, trials):
-        results.append(result)
-        if not options.json:
-            print(result.text(), flush=True)
+    handlers = heed(_interrupt)
+    try:
+        for result in _results(options, trials):
+            results.append(result)
+            if not options.json:
+                print(result.text(), flush=True)
+    finally:
+        restore(handlers)
     failed = sum(not result.passed for result in results)
     if options.json:
         print(json.dumps({"passed": not failed, "trials": [result.document() for result in results]}))
     else:
         print(f"{len(results) - failed} of {len(results)} trials passed")
     return EXIT_NO if failed else EXIT_GOOD
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Once: the program is then ended, which a second signal is not to keep from being done."""
+    heed(lambda number, frame: None)
+    raise Interrupted(number)
 
 
 def _results(options: argparse.Namespace, trials: list[_Trial]) -> Iterator[Result]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from places import GOLDEN, ROOT
-from runs import PATIENCE
+from runs import PATIENCE, wait_until_gone
 
 from designer.cli import main
 
@@ -79,6 +82,23 @@ def test_people_read_a_line_for_each_trial(capsys: pytest.CaptureFixture[str]) -
     )
     assert "paced_node.py can do that" in second
     assert last == "1 of 2 trials passed"
+
+
+def test_nothing_is_left_where_it_is_asked_to_end(tmp_path: Path) -> None:
+    """The program is one that heeds no signal, and has started another; one sentence, and the signal's exit code."""
+    script = tmp_path / "deaf.sh"
+    script.write_text(f"trap '' TERM HUP INT\nsleep 9999999 &\necho $$ $! > {tmp_path}/new\n"
+                      f"mv {tmp_path}/new {tmp_path}/pids\nwait\n")  # fmt: skip
+    command = [sys.executable, "-m", "designer", "conform", "--only", "lossy", *PATIENT, "--", "sh", str(script)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as conform:
+        until = time.monotonic() + PATIENCE
+        while not (tmp_path / "pids").exists() and time.monotonic() < until:
+            time.sleep(0.02)
+        conform.terminate()
+        _, said = conform.communicate(timeout=PATIENCE)
+    assert conform.returncode == 128 + signal.SIGTERM, said
+    assert len(said.splitlines()) == 1, said
+    wait_until_gone([int(pid) for pid in (tmp_path / "pids").read_text().split()])
 
 
 def test_what_would_be_tried_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
