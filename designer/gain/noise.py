@@ -56,8 +56,9 @@ def steady_state(model: ErrorModel, *, initial: int) -> SteadyState | None:
         return None
     per_node = _weighed(model, X.sum(axis=0) / both)
     off, total = _off(decays, operator, X, fresh + carried(X) - X), float(per_node.sum())
-    error = off / total if total > 0.0 else off
-    return SteadyState(per_node, error) if error <= SETTLED else None
+    if per_node.min() < 0.0 or not off <= SETTLED * total:  # or what cancels in M leaves rounding alone
+        return None
+    return SteadyState(per_node, off / total if total > 0.0 else 0.0)
 
 
 def long_run(transition: Array, initial: int) -> Array:

@@ -24,6 +24,7 @@ from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
 from designer.proof.prover import Prover
+from designer.search.starts import ignoring
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 Document = dict[str, Any]
@@ -269,3 +270,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert main(["analyse", "two-nodes", "--gains", str(wild), "-o", "never.json"]) == 1
     assert "NOT mean-square stable" in capsys.readouterr().out
     assert not Path("never.json").exists()
+
+
+def test_how_many_steps_show_the_lower_end_is_said_where_it_is_known() -> None:
+    """One is singular; of errors that decay slowly it is not known."""
+    problem = find("two-nodes")
+    found = analyse(problem, GivenGains(*link_gains(problem, *ignoring(problem)), "mine", None))
+    assert "proved: 1 step shows that it is no less\n" in found._replace(horizon=1, radius=0.5).text()
+    assert "proved: 2 steps show that it is no less\n" in found._replace(horizon=2, radius=0.5).text()
+    assert "no less" not in found._replace(horizon=2, radius=0.9999).text()

@@ -126,3 +126,12 @@ def test_how_often_a_chain_is_where() -> None:
     chain = np.array([[0.0, 0.25, 0.75, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.9, 0.1], [0.0, 0.0, 0.3, 0.7]])
     np.testing.assert_allclose(long_run(chain, 0), [0.0, 0.25, 0.5625, 0.1875], atol=1e-12)
     np.testing.assert_allclose(long_run(chain, 1), [0.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_mean_square_below_0_is_no_answer(seed: int) -> None:
+    """Where M cancels what moves alike, rounding is all that is left, of either sign."""
+    document = random_problem(seed, n=2, nw=1, modes=1).document()
+    document["plant"] |= {"A": [[0.5, 0.0], [0.0, 0.5]], "B": [[0.7], [0.7]], "M": [[1.0, -1.0000000001]]}
+    problem = Problem.from_document(document)
+    assert steady_state(error_model(problem, *consensus_gains(problem)), initial=0) is None
