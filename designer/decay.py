@@ -26,6 +26,7 @@ Map = Callable[[Array], Array]
 _TERMS = 300  # that are added one by one, which rounds least; what decays more slowly is solved for
 _DENSE = 1000  # unknowns up to which L is written out as a matrix
 _FEW = 40  # and up to which its eigenvalues take no time
+_ROUGH = 1e-4, 10  # tolerance and restarts of Arnoldi's method beyond twice as many: a product takes up to 0.1 s
 _TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to rounding, and Arnoldi's method most of all
 _STEPS = 30  # in which it is looked for
 _HUGE = 1e150
@@ -223,8 +224,9 @@ def spectral_radius(L: Map, modes: int, n: int) -> float:
         from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
         operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
+        tol, restarts = (1e-10, 60) if order <= 2 * _DENSE else _ROUGH
         try:
-            found = eigs(operator, k=1, v0=first + 1e-30, tol=1e-10, maxiter=60, return_eigenvectors=False)
+            found = eigs(operator, k=1, v0=first + 1e-30, tol=tol, maxiter=restarts, return_eigenvectors=False)
             radius = float(np.abs(found).max())
             if order > 2 * _DENSE or not _has_transient(L, modes, n, radius):
                 return radius

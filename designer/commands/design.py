@@ -232,9 +232,10 @@ def _chosen_method(problem: Problem, budget: float | None) -> str:
         )
     elif min(seconds, budget) > LONG:
         so_far = f" of about {in_words(seconds)}" if seconds > budget else ""
+        slower = "" if seconds > budget else f", or up to {in_words(budget)} where errors turn out to decay slowly"
         print(
-            f"method exact: it takes about {in_words(min(seconds, budget))}{so_far} here; --budget 1min less, and "
-            "--method decomposed is faster",
+            f"method exact: it takes about {in_words(min(seconds, budget))}{so_far} here{slower}; --budget 1min less, "
+            "and --method decomposed is faster",
             file=sys.stderr,
         )
     return method

@@ -20,6 +20,8 @@ from designer.model.error_model import ErrorModel, LinkTerms
 from designer.model.units import natural_scale
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
+_WIDTH_OF_LARGE = 1e-4  # where a sweep takes 10 s and more, and one that holds near gamma several times as many steps
+_LARGE = 800  # n_eta from which that is so
 _WIDTH_OF_NODES = 1e-4
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
@@ -260,8 +262,11 @@ def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: In
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
-def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
-    """The exact gain of an error model, between bounds that differ by `width` of its square where steps suffice."""
+def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
+    """The exact gain of an error model, between bounds that differ by `width` of its square where steps suffice.
+
+    None: 1e-6, of large networks 1e-4.
+    """
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     decays = decay(operator.corner, len(operator.MM), operator.units)
@@ -270,6 +275,8 @@ def exact_gain(model: ErrorModel, *, width: float = _WIDTH) -> Gain:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
     invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
+    if width is None:
+        width = _WIDTH if model.size < _LARGE else _WIDTH_OF_LARGE
     found = _bracket(operator, _MOST_STEPS, invariant, width)
     return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P[0], decays.radius)
 

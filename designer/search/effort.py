@@ -30,7 +30,7 @@ _MORE = 2.65  # times as many of large networks
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
 _WORK = 50  # matrices as large as Y_bar that the search keeps beside those of the horizon
-_WORK_OF_WINDOWS = 25  # and without a search of the whole: starts, exact gain and proof
+_WORK_OF_WINDOWS = 35  # and without a search of the whole: starts, exact gain and proof
 _OTHERS = 2e8  # bytes, whatever the size
 
 

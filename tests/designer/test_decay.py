@@ -124,6 +124,13 @@ def test_without_scipy_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[1] == pytest.approx(found[0], rel=1e-6, abs=1e-9)
 
 
+def test_the_radius_of_a_large_network_is_known_to_four_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    operator = operator_of(chain([0.9, 0.3, -0.5, 0.7, 0.2]))
+    monkeypatch.setattr(module, "_FEW", 0)
+    monkeypatch.setattr(module, "_DENSE", 0)
+    assert spectral_radius(operator.corner, 1, 5) == pytest.approx(0.81, rel=1e-3)
+
+
 @pytest.mark.parametrize("radius", [0.9, 0.9999, 1.001])
 def test_large_networks_are_solved_without_a_matrix(radius: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_DENSE", 0)

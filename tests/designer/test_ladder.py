@@ -175,7 +175,7 @@ def test_windows_need_less_memory_than_a_search_of_all_at_once() -> None:
     large, dense = banded(500), everybody_hears_everybody(MOST_NODES + 1)
     assert [whole_fits(large, free=free) for free in (2e9, 4e9)] == [False, True]
     refuse_without_memory(large, free=2e9)
-    with pytest.raises(InputError, match=r"needs about 1\.0 GB of memory for 500 nodes"):
+    with pytest.raises(InputError, match=r"needs about 1\.3 GB of memory for 500 nodes"):
         refuse_without_memory(large, free=9e8)
     with pytest.raises(InputError, match=r"needs about 1\.3 GB of memory for 201 nodes"):
         refuse_without_memory(dense, free=9e8)

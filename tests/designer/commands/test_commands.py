@@ -125,6 +125,19 @@ def test_what_there_is_when_time_is_over_is_certified(folder: Path, capsys: pyte
     assert run("verify", "gains.json") == 0
 
 
+def test_what_an_estimate_may_miss_the_budget_bounds(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How slowly errors decay at the least gain is not known beforehand; that the budget ends the search is."""
+    for seconds, said in (
+        (120.0, "2 minutes here, or up to 3 minutes where"),
+        (1000.0, "3 minutes of about 17 minutes here; "),
+    ):
+        monkeypatch.setattr(effort, "seconds_of_exact", lambda problem, found=seconds: found)
+        assert run("design", "two-nodes", "-o", "gains.json", "--force", "--budget", "180s") == 0
+        assert capsys.readouterr().err.startswith(f"method exact: it takes about {said}")
+
+
 @pytest.mark.parametrize("text", ["0", "10 min", "1d", "-1s", "min"])
 def test_a_budget_is_a_time(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):

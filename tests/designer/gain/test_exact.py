@@ -214,6 +214,19 @@ def test_the_interval_closes_on_what_longer_horizons_show(case: Case) -> None:
     assert gain.stable
 
 
+@pytest.mark.parametrize("case", CASES[:2])
+def test_the_interval_of_a_large_network_is_wider_and_holds_the_gain(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = error_model(*case)
+    gain = exact_gain(model)
+    monkeypatch.setattr(exact, "_LARGE", 1)
+    wider = exact_gain(model)
+    assert wider.low <= gain.high
+    assert gain.low <= wider.high
+    assert gain.high - gain.low < wider.high - wider.low <= 1e-4 * wider.high
+
+
 @pytest.mark.parametrize("case", [*CASES, *REAL])
 def test_a_sweep_that_ends_in_the_invariant_set_ends_as_a_long_one_does(case: Case) -> None:
     """At every g the answer is that of 400 steps; and (17) for a larger P would be false, so a larger set is none."""
