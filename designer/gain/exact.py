@@ -21,7 +21,7 @@ from designer.model.units import natural_scale
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _WIDTH_OF_LARGE = 1e-4  # where a sweep takes 10 s and more, and one that holds near gamma several times as many steps
-_LARGE = 800  # n_eta from which that is so
+_LARGE = 900  # n_eta from which that is so
 _WIDTH_OF_NODES = 1e-4
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
