@@ -407,7 +407,7 @@ def _draws(network: Network, seeds: Sequence[int], steps: int) -> Iterator[Draws
             yield Draws(uniform[MODES][k], uniform[LOSSES][k] < network.beta, uniform[DELIVERIES][k] < network.rho, w)
 
 
-def _ensemble(gamma: float, found: Tally, energy: Array, start: float) -> Ensemble:
+def _ensemble(gamma: float, found: Tally, energy: Array, start: float = 0.0) -> Ensemble:
     runs, steps = found.runs, len(found.mean)
     quantile = NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * steps))
     with np.errstate(over="ignore", invalid="ignore"):

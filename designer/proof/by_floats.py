@@ -50,6 +50,7 @@ class ByFloats:
         """Floats above M'M of every model that this is about, (modes, n_eta, n_eta)."""
         return self.start(up=True)
 
+    @np.errstate(all="ignore")  # what is not finite decides nothing
     def inequality_17(self, P: Array) -> list[Sign]:
         return self.inequality_17_of(P, self.model.joint(symmetric(P)))
 

@@ -503,7 +503,7 @@ def simulate_command(folder: Path, *arguments: object, gains: Gains) -> int:
 
 KEYS = {
     "problem", "runs", "steps", "seed", "disturbance", "gamma", "claimed", "confidence", "peak", "closest", "gain",
-    "refuted", "refuted_at", "single", "seconds", "steady", "output",
+    "refuted", "refuted_at", "single", "seconds", "steady", "output", "start",
 }  # fmt: skip
 
 
