@@ -394,14 +394,16 @@ class _Content:
         steps = len(self.columns["has"][:steps])
         if not self.is_paced:
             return Absences.none(steps, len(self.topics), len(self._external))
+        void = self._void(end)
+        accounted = self.examiner.whole.get(PLANT, 0) + sum(map(len, void.get(PLANT, ())))
         return Absences.of(
             self.topics,
             self.columns,
             self.said,
-            self._void(end),
+            void,
             external=self._external,
             steps=steps,
-            plant_is_whole=str(self.examiner.whole.get(PLANT, 0)) == end.get(f"received.{PLANT}", "0"),
+            plant_is_whole=str(accounted) == end.get(f"received.{PLANT}", "0"),
             resumed="resumed" in self._kinds,
         )
 

@@ -190,7 +190,8 @@ class Sender:
                 detail = f"exchanged: it was sent as number {number}"
                 self._accuse(Finding("exchanged", self.who, seen.number, seen.topic, seen.step, detail))
 
-        self.is_whole = not self.total and self.checked == sent
+        last = self._blocks[max(self._blocks)].head.hex() if self._blocks else ""
+        self.is_whole = bool(end_head) and last == end_head and not (self.total or self.absent or self.unchecked)
 
     def absences(self) -> Absent:
         """What is absent, for Findings."""
