@@ -144,21 +144,24 @@ def alone(part: Path) -> str:
 def test_everything_at_once(gains_path: Path, tmp_path: Path) -> None:
     """A node, the plant, the recorder and the coordinator, one after the other before any of them is back.
 
-    The recorder goes last but one, long enough after the node to have on disk what the node has said.
+    On a busy machine the recorder may not have on disk yet what the others said last: that is lost with them, and run
+    and replay both say that the record is not whole. Nobody is accused.
     """
     recording = tmp_path / "run.mcap"
-    _, verdict = survived(
-        gains_path,
-        recording,
-        "kill:node=n2,step=8",
-        "kill:plant,step=10",
-        "kill:recorder,step=12",
-        "kill:coordinator,step=13",
-    )
+    kills = ("kill:node=n2,step=8", "kill:plant,step=10", "kill:recorder,step=12", "kill:coordinator,step=13")
+    options = [word for kill in kills for word in ("--fault", kill)]
+    ran = peakmesh("run", gains_path, *PERIOD, *options, "-o", recording, "--json")
+    summary, verdict = answer(ran), replay(recording)
+    assert not summary["broken_off"], ran.stderr
+    assert ran.returncode == (3 if summary["not_whole"] else 0)
+    assert verdict.exit_code in ((0, 3) if summary["not_whole"] else (0,)), verdict.text()
+    assert all(proof.holds for proof in verdict.proofs)
+    assert verdict.steps == STEPS
     assert verdict.pacing is not None
+    assert verdict.pacing.faults == kills
     assert len(verdict.pacing.beginnings) == 1
     modes = [decoded(message).step for message in logged(recording) if message.topic == "mode"]
-    assert modes == list(range(STEPS))
+    assert sorted(modes) == list(range(STEPS)) or summary["not_whole"]
 
 
 def test_several_faults_at_once(gains_path: Path, tmp_path: Path) -> None:
