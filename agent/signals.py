@@ -11,9 +11,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
+
+from agent.contract.errors import Interrupted
 
 Handler = Callable[[int, FrameType | None], None]
 Handlers = dict[int, Any]  # of signals; what signal.signal returns
@@ -45,3 +48,28 @@ def restore(handlers: Handlers) -> None:
     """Give the signals back."""
     for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+@contextmanager
+def interrupted_through(hand_over: Callable[[Callable[[], NoReturn]], None]) -> Iterator[None]:
+    """While a session is open: a signal raises Interrupted where the main thread next does a duty that it was handed.
+
+    Not where it finds that thread, which may be in a callback of zenoh's, where an exception is printed and lost.
+    Whoever leaves the block without having done the duty is interrupted there.
+    """
+    asked: list[int] = []
+
+    def interrupt() -> NoReturn:
+        raise Interrupted(asked[0])
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        hand_over(interrupt)
+
+    before = heed(stop)
+    try:
+        yield
+    finally:
+        restore(before)
+    if asked:
+        interrupt()

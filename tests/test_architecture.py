@@ -39,7 +39,7 @@ ROOMS = {
     "agent.children": "",
     "agent.guests": "",
     "agent.launch": "agent.children agent.contract.recording agent.guests agent.plan agent.signals",
-    "agent.conform": "agent.estimates agent.filter agent.guard agent.guests agent.network agent.roles",
+    "agent.conform": "agent.estimates agent.filter agent.guard agent.guests agent.network agent.roles agent.signals",
     "agent.doctor": "agent.children agent.network agent.roles",
     "agent.commands": "agent.authority agent.contract.recording agent.doctor agent.faults agent.guard agent.guests "
     "agent.launch agent.network agent.plan agent.roles",

@@ -63,7 +63,7 @@ Heard = Came | Gone | Garbled | Ended | Sample | Joining | Ready | Leaving | Rep
 
 
 class Stage:
-    """Use it with `with`. `hand_over` may be called by any thread, the rest by one."""
+    """Use it with `with`. `hand_over` and `have` may be called by any thread, the rest by one."""
 
     def __init__(self, run: str, node: str) -> None:
         self._who, self._words, self._outboxes = node_who(node), 0, dict[str, Outbox]()
@@ -93,7 +93,11 @@ class Stage:
 
     def hand_over(self, heard: Heard) -> None:
         """Have `next` return it."""
-        self._queue.put(lambda: heard)
+        self.have(lambda: heard)
+
+    def have(self, duty: Callable[[], Any]) -> None:
+        """Have `next` do it, and return what it returns."""
+        self._queue.put(duty)
 
     def next(self, seconds: float) -> Heard | None:
         """What is heard next; None where it is nothing for so long."""

@@ -20,6 +20,7 @@ from agent.guard import Guard, Unfit
 from agent.guests import programs
 from agent.network.acquaintance import refuse_version
 from agent.network.words import Replayed, Sample
+from agent.signals import interrupted_through
 
 RUN = "conform"
 KEPT = 3  # messages that the recorder acts as if it lacked them at the end
@@ -69,6 +70,8 @@ class Trial:
         except BaseException:
             self.stage.close()
             raise
+        self._interruptible = interrupted_through(self.stage.have)
+        self._interruptible.__enter__()
 
     def __enter__(self) -> Self:
         return self
@@ -78,6 +81,7 @@ class Trial:
     ) -> None:
         self.program.close()
         self.stage.close()
+        self._interruptible.__exit__(kind, error, trace)
 
     # What is heard.
     def until(self, condition: Callable[[], object], what: str, *, seconds: float | None = None) -> None:

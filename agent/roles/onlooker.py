@@ -7,9 +7,8 @@ messages, and is never used for recording.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Set
+from collections.abc import Callable, Iterator, Set
 from contextlib import closing, contextmanager
-from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import NoReturn
 
@@ -22,7 +21,7 @@ from agent.network.arrivals import Arrival, Arrivals
 from agent.network.configuration import Network
 from agent.network.session import Channel, Session
 from agent.network.words import Sample, Words
-from agent.signals import heed, restore
+from agent.signals import heed, interrupted_through, restore
 
 ASK_SECONDS = 1.0  # what is not answered by then is asked again
 AMONG_SECONDS = 0.2  # after the first run that is found, others have so long to show themselves
@@ -68,58 +67,64 @@ def looking_on(network: Network, *, run: str | None) -> Iterator[Onlooker]:
 
     Raises RunBroken where there is none within `network.wait` seconds, InputError where there are several.
     """
-    with stopped_by_signals():
-        name = find_run(network) if run is None else run
-        words = Words("")
-        with closing(Session(network, run=name, who=VIEWER, hand_over=words.put)) as session:
-            heard = session.overhear()
-            session.watch(words.see)
-            wait_for_coordinator(words, name, network.wait)
-            onlooker = Onlooker(session, words, heard, name)
-            onlooker.heed()
-            yield onlooker
+    name = find_run(network) if run is None else run
+    words = Words("")
+    with viewing(network, name, words) as session:
+        heard = session.overhear()
+        session.watch(words.see)
+        wait_for_coordinator(words, name, network.wait)
+        onlooker = Onlooker(session, words, heard, name)
+        onlooker.heed()
+        yield onlooker
 
 
 def find_run(network: Network) -> str:
     """The name of the only run on this network."""
-    found: SimpleQueue[str] = SimpleQueue()
-    with closing(Session(network, run="", who=VIEWER, hand_over=lambda duty: None)) as session:
-        session.watch_runs(found.put)
-        try:
-            names = {found.get(timeout=network.wait)}
-        except Empty:
+    words = Words("")
+    with viewing(network, "", words) as session:
+        session.watch_runs(lambda run: words.see(run, "", True))
+        if not _until(words, lambda: bool(words.present), network.wait):
             where = ", ".join(network.connect)
-            raise RunBroken(f"no run was found at {where} within {network.wait:g} s") from None
-        deadline = time.monotonic() + AMONG_SECONDS
-        while len(names) == 1 and (left := deadline - time.monotonic()) > 0.0:
-            try:
-                names.add(found.get(timeout=left))
-            except Empty:
-                break
+            raise RunBroken(f"no run was found at {where} within {network.wait:g} s")
+        _until(words, lambda: len(words.present) > 1, AMONG_SECONDS)
+    names = sorted(words.present)
     if len(names) > 1:
-        raise InputError(f"there are the runs {listed(sorted(names))}; choose one with --run")
-    return names.pop()
+        raise InputError(f"there are the runs {listed(names)}; choose one with --run")
+    return names[0]
 
 
 def wait_for_coordinator(words: Words, run: str, seconds: float) -> None:
     """Until it is there; RunBroken where that takes longer."""
+    if not _until(words, lambda: COORDINATOR in words.present, seconds):
+        raise RunBroken(f'the coordinator of run "{run}" was not found within {seconds:g} s')
+
+
+def _until(words: Words, condition: Callable[[], bool], seconds: float) -> bool:
+    """Take words until the condition holds; False where it does not within so many seconds."""
     deadline = time.monotonic() + seconds
-    while COORDINATOR not in words.present:
+    while not condition():
         if time.monotonic() >= deadline:
-            raise RunBroken(f'the coordinator of run "{run}" was not found within {seconds:g} s')
+            return False
         words.take(deadline)
+    return True
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[None]:
-    """Signals that ask for an end raise Interrupted; a terminal that is closed is one."""
+def viewing(network: Network, run: str, words: Words) -> Iterator[Session]:
+    """A session that hands its duties to `words`. A signal that asks for an end is raised as Interrupted: wherever it
+    finds us while the session is opened, from then on where words are taken; a terminal that is closed is one.
+    """
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise Interrupted(number)
 
     before = heed(stop)
     try:
-        yield
+        with (
+            closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session,
+            interrupted_through(words.put),
+        ):
+            yield session
     finally:
         restore(before)
 

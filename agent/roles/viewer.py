@@ -10,17 +10,17 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 from agent.contract.errors import InputError
 from agent.contract.extras import needing
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, EVENT, VIEWER, data_topics, model_of
+from agent.contract.keys import COORDINATOR, EVENT, data_topics, model_of
 from agent.network.configuration import Network
-from agent.network.session import Channel, Session
+from agent.network.session import Channel
 from agent.network.words import ChannelClosed, Words
-from agent.roles.onlooker import stopped_by_signals, wait_for_coordinator
+from agent.roles.onlooker import viewing, wait_for_coordinator
 
 
 def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: Callable[[str], None]) -> None:
@@ -29,7 +29,7 @@ def run(network: Network, gains: Gains, *, run: str, host: str, port: int, say: 
     Raises RunBroken where the run is not there within `network.wait` seconds, InputError where the port is taken.
     """
     words = Words("")
-    with stopped_by_signals(), closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session:
+    with viewing(network, run, words) as session:
         overheard = session.overhear()
         with _server(gains, run, host, port) as (address, show):
             say(address)

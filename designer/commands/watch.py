@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from agent.commands.looking import add_looker, look_on
 from agent.commands.options import Subcommands, load_gains
 from agent.commands.variables import heed_variables
-from agent.contract.errors import EXIT_GOOD, InputError, Interrupted, RunBroken
+from agent.contract.errors import EXIT_GOOD, InputError, RunBroken
 
 if TYPE_CHECKING:
     from agent.commands.looking import Onlooker
@@ -84,8 +84,6 @@ def _take_in(onlooker: Onlooker, scene: Scene, deadline: float, digest: str) -> 
     for sample, at in onlooker.until(deadline):
         try:
             message = decode(sample.topic, sample.payload)
-        except Interrupted:
-            raise
         except RunBroken:  # somebody says what is no message
             scene.unreadable += 1
         else:
