@@ -95,7 +95,7 @@ class Guard:
     """
 
     def __init__(self) -> None:
-        self.now = 0  # the step that its owner is at; what is far ahead of it is refused
+        self.now = 0  # the step that its owner has come to; what is far ahead of it is refused
         self._problem: Problem | None = None
         self._forms: dict[str, _Form] = {}
         self._cast: frozenset[str] = frozenset()

@@ -371,6 +371,7 @@ class Bus:
         """Send a data message, and keep it until the recorder has it. Raises ChannelClosed where the run is over."""
         if self.is_over:
             raise ChannelClosed
+        self.guard.now = max(self.guard.now, message.step)
         self._session.publish(self._outbox.add(topic, message.encode()))
 
     def wait_for_nobody(self) -> None:
@@ -444,7 +445,8 @@ class Bus:
         self._say(CONTROL, control.model_copy(update={"version": version("peakmesh")}))
 
     def acknowledge(self, acknowledged: Acknowledged) -> None:
-        """The recorder's word to everybody."""
+        """The recorder's word to everybody; no mode comes that is more than a window ahead of its steps."""
+        self.guard.now = acknowledged.steps
         self._say(ACKNOWLEDGED, acknowledged)
 
     def tell_viewers(self, facts: Facts) -> None:

@@ -85,7 +85,6 @@ def _in_lock_step(
     inbox, x_hat = Inbox(own), np.zeros(own.M.shape[1])
     mode, heard = "", list[str]()  # what made x_hat
     for k in count():
-        bus.guard.now = k
         while inbox.y is None:
             _put(inbox, measurements.next())
         sent = told(own, k, Pair(x_hat, innovation(own, inbox.y, x_hat)), mode=mode, heard=heard)

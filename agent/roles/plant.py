@@ -51,7 +51,6 @@ def run(bus: Bus, gains: Gains, *, dynamics: Dynamics | None = None) -> None:
                     first = plant.step  # whose mode may have gone with the coordinator: late is better than never
                 plant.skip_to(first)
                 bus.step = step + 1
-            bus.guard.now = step
             for k in range(first, step + 1):
                 state, measurements = plant.advance(k)
                 for name, y in measurements.items():

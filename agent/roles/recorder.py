@@ -194,7 +194,6 @@ class Recorder:
         step = admitted.message.step
         if self._record.take(admitted.topic, admitted.payload, admitted.stamp, step):
             self._quiet_since = time.monotonic()
-        self._bus.guard.now = self._record.receipts.complete
         if self._ordeal is not None and admitted.topic == MODE:
             suffer(self._ordeal.due(step))
 

@@ -146,3 +146,12 @@ def test_nothing_is_published_when_the_run_is_over(node: Bus) -> None:
     with pytest.raises(ChannelClosed):
         node.publish("mode", Mode(step=1, mode="a"))
     assert node.unrecorded == 1
+
+
+def test_who_publishes_or_acknowledges_has_come_to_that_step(node: Bus, recorder: Bus) -> None:
+    """Whatever the role, what is far ahead of it is refused; an event about the past takes it nowhere."""
+    for step, now in ((0, 0), (5000, 5000), (4999, 5000)):
+        node.publish("mode", Mode(step=step, mode="a"))
+        assert node.guard.now == now
+    recorder.acknowledge(CLOSED.model_copy(update={"steps": 5000}))
+    assert recorder.guard.now == 5000
