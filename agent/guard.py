@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from pydantic import ValidationError
@@ -22,10 +22,7 @@ from agent.contract.keys import (
     CONTROL,
     COORDINATOR,
     EVENT,
-    MODE,
     PLANT,
-    PLANT_STATE,
-    estimate,
     measurement,
     model_of,
     node_who,
@@ -47,6 +44,7 @@ from agent.contract.messages import (
     tag_of,
 )
 from agent.contract.problem import Problem
+from agent.contract.sizes import longest, vectors
 from agent.plan import LARGEST_WINDOW
 
 FORGED = "forged"  # not from who sends there, by name or session
@@ -63,8 +61,6 @@ KINDS = (FORGED, UNREADABLE, OVERSIZED, MISSHAPEN, INFINITE, UNTIMELY, MISNUMBER
 
 AHEAD = 2 * LARGEST_WINDOW  # steps: modes run a window ahead of the slowest, and what answers to them, too
 WINDOW = 1024  # numbers: older ones than that are taken for repeated
-_OF_A_NUMBER, _OF_THE_REST = 26, 512  # bytes of JSON
-_LONGEST_EVENT = 1 << 16
 _OTHER_TOPICS = "other"
 READY, REFUSALS, REPLAY = "ready", "refusals", "replay"  # of everybody together
 
@@ -119,7 +115,7 @@ class Guard:
         self._cast = frozenset([*participants(problem), *map(sensor_who, names)])
         self._nodes = frozenset(names)
         self._modes = {name: place for place, name in enumerate(problem.mode_names)}
-        self._forms = {topic: _form(problem, topic) for topic in _topics(problem)}
+        self._forms = _forms(problem)
 
     def begin(self, *, steps: int, external: tuple[str, ...], paced: bool) -> None:
         """The run begins; `external` are the nodes that a sensor measures, which need not stamp what it sends."""
@@ -342,32 +338,17 @@ def _any_form(topic: str) -> _Form:
     return _Form(senders, (), True, 1 << 24)
 
 
-def _topics(problem: Problem) -> Iterator[str]:
-    yield from (MODE, PLANT_STATE, EVENT, ACCOUNT)
-    for name in problem.node_names:
-        yield from (measurement(name), estimate(name))
-
-
-def _form(problem: Problem, topic: str) -> _Form:
+def _forms(problem: Problem) -> dict[str, _Form]:
     nodes = frozenset(map(node_who, problem.node_names))
-    names = sum(len(name.encode()) + 3 for name in (*problem.node_names, *problem.mode_names))
-    sizes: dict[str, int] = {}
-    may_be_empty = False
-    match topic.split("/"):
-        case ["mode"]:
-            senders = frozenset({COORDINATOR})
-        case ["plant", "state"]:
-            senders = frozenset({PLANT})
-            sizes = {"x": problem.nx, "z": problem.nz, "w": problem.nw, "arrived": problem.n}
-        case ["node", name, "measurement"]:
-            node = problem.nodes[problem.node_index(name)]
-            senders, sizes, may_be_empty = frozenset({PLANT, sensor_who(name), ""}), {"y": len(node.C)}, node.seen
-        case ["node", name, "estimate"]:
-            ny = len(problem.nodes[problem.node_index(name)].C)
-            senders, sizes = frozenset({node_who(name)}), {"x_hat": problem.nx, "innovation": ny, "z_hat": problem.nz}
-        case ["event"]:
-            return _Form(nodes | {COORDINATOR}, (), True, _LONGEST_EVENT)
-        case _:
-            return _Form(nodes, (), True, _OF_THE_REST + 16 * _OF_A_NUMBER)
-    longest = _OF_THE_REST + names + _OF_A_NUMBER * sum(sizes.values())
-    return _Form(senders, tuple(sizes.items()), may_be_empty, longest)
+    senders = {EVENT: nodes | {COORDINATOR}, ACCOUNT: nodes}
+    senders |= {measurement(name): frozenset({PLANT, sensor_who(name), ""}) for name in problem.node_names}
+    may_be_empty = {measurement(node.name) for node in problem.nodes if node.seen}
+    return {
+        topic: _Form(
+            senders.get(topic, frozenset({sender_of(topic)})),
+            tuple(vectors(problem, topic).items()),
+            topic in may_be_empty,
+            size,
+        )
+        for topic, size in longest(problem).items()
+    }
