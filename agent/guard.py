@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from pydantic import ValidationError
 
@@ -35,6 +35,7 @@ from agent.contract.messages import (
     Account,
     Estimate,
     Event,
+    Measurement,
     Message,
     Mode,
     PlantState,
@@ -104,6 +105,7 @@ class Guard:
         self._tags: dict[str, frozenset[bytes]] = {}
         self._seen: dict[tuple[str, str, bytes], _Numbers] = {}
         self._last_words: dict[tuple[str, str], int] = {}  # by session and topic, the number of the last
+        self._unheld: dict[str, int] = {}  # by topic, the first step for whose measurement there was no room
         self._lock = threading.Lock()
         self._counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
@@ -229,6 +231,24 @@ class Guard:
         if size > form.longest:
             raise Unfit(OVERSIZED)
         return form
+
+    def turn_away(self, topic: str, payload: bytes, stamp: Stamp | None) -> NoReturn:
+        """There is no room for a message. Raises Unfit, and notes what its sender might not give once more."""
+        if model_of(topic) is Measurement:
+            step = self.admit(topic, payload, stamp).step
+            if step >= self.now:
+                self._unheld[topic] = min(step, self._unheld.get(topic, step))
+        raise Unfit(FLOOD)
+
+    def lost(self) -> tuple[str, int] | None:
+        """Topic and step of a measurement that was turned away and that nobody gives again: a sensor keeps nothing.
+
+        Against the clock it is a message like others that are not there in time.
+        """
+        for topic, step in self._unheld.items():
+            if topic in self._sensed and step < self._steps and not self._is_paced:
+                return topic, step
+        return None
 
     def first_time(self, topic: str, step: int, stamp: Stamp | None) -> bool:
         """Whether a message has not been there yet, by its number, or by its step where it has none."""

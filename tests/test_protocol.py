@@ -11,6 +11,8 @@ from agent.contract import keys, messages
 from agent.contract.schedule import DELIVERIES
 from agent.guard import AHEAD, KINDS
 from agent.guests import _VARIABLES
+from agent.network.session import CAPACITY
+from agent.plan import LARGEST_WINDOW
 
 TEXT = (ROOT / "docs" / "protocol.md").read_text()
 SECTIONS = dict(re.findall(r"^##+ (.*?)\n(.*?)(?=^##|\Z)", TEXT, flags=re.DOTALL | re.MULTILINE))
@@ -70,6 +72,7 @@ def test_keys_are_those_of_the_table() -> None:
 def test_what_is_refused_is_named() -> None:
     assert [re.findall(r"`(\w+)`", row[0])[0] for row in rows("What is refused")] == list(KINDS)
     assert f"more than {AHEAD} ahead" in SECTIONS["What is refused"]
+    assert f"more wait than are kept ({CAPACITY} of a topic)" in SECTIONS["What is refused"]
 
 
 def test_the_attachment_has_these_bytes() -> None:
@@ -91,4 +94,6 @@ def test_what_a_program_is_told() -> None:
 def test_numbers_in_sentences() -> None:
     assert f"key (`seed`, {DELIVERIES})" in SECTIONS["A step"]
     assert f"{messages.CEILING:.0e}".replace("+", "") in SECTIONS["What it says and hears"].replace("\n", " ")
+    room = f"no more than {LARGEST_WINDOW} steps ahead of the last mode has room where it waits, {CAPACITY} messages"
+    assert room in SECTIONS["Measurement"].replace("\n", " ")
     assert messages.ZERO_STATE in SECTIONS["Against the clock"]

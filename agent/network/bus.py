@@ -79,6 +79,7 @@ from agent.network.words import (
     Sample,
     Words,
 )
+from agent.plan import LARGEST_WINDOW
 from agent.signals import Handler, Handlers, heed, restore
 
 # Seconds of silence that end a wait. Silence, because on a busy machine everything takes long, but goes on.
@@ -466,11 +467,20 @@ class Bus:
 
     # Meanwhile.
     def _keep_house(self) -> float:
-        """See that no queue of zenoh's is full, and tell the coordinator what was refused; when to do so again."""
+        """See that no queue of zenoh's is full, and tell the coordinator what was refused; when to do so again.
+
+        RunBroken where the run cannot go on for want of what had no room.
+        """
         now = time.monotonic()
         if now < self._house_due:
             return self._house_due
         fullest = max((gate.relieve() for gate in self._gates), default=0)
+        if (lost := self.guard.lost()) is not None and not self._leaving:
+            topic, step = lost
+            raise RunBroken(
+                f"{in_words(self.who)} has no room for step {step} of {topic}: {CAPACITY} messages wait there; "
+                f"a sensor must not be more than {LARGEST_WINDOW} steps ahead of the mode"
+            )
         self._house_due = now + (HOUSE_SECONDS if fullest < CAPACITY // 8 else BUSY_SECONDS)
         if now >= self._told + TELL_SECONDS:
             self._told = now

@@ -126,7 +126,7 @@ class Gate:
         try:
             vouch(self._guard, sample)
             if len(self._kept) >= CAPACITY:
-                raise Unfit(FLOOD)
+                self._guard.turn_away(sample.topic, sample.payload, sample.stamp)
             self._kept.append(sample)
         except Unfit as unfit:
             self._guard.refuse(self.topic, unfit.kind)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from itertools import chain
 from typing import Any, NamedTuple
 
 import pytest
@@ -354,6 +355,42 @@ def test_a_flood_takes_no_more_memory_than_a_channel_has(session: str) -> None:
     came = gate.waiting(2 * total)
     assert [each.stamp.number for each in came if each.stamp is not None] == list(range(kept))
     assert len(made._seen) == (session == "own")
+
+
+def lost_of(made: Guard, *letters: Letter) -> tuple[str, int] | None:
+    """What is lost for good where these come at a gate that is full."""
+    before = (change("y", step=0)._replace(sender="").sample for _ in range(CAPACITY))
+    channel = Full(measurement("n0"), chain(before, (letter.sample for letter in letters)))
+    gate = Gate(channel, made, for_record=False)  # type: ignore[arg-type]  # as much as it uses
+    while gate.relieve():
+        pass
+    return made.lost()
+
+
+def reading(step: int, **changes: Any) -> Letter:
+    """What a sensor sends."""
+    return change("y", step=step, **changes)._replace(sender="")
+
+
+def test_a_reading_that_finds_no_room_is_lost_where_the_run_needs_it() -> None:
+    """A sensor gives it once; who is told of the first one knows which."""
+    of_n0 = measurement("n0")
+    assert lost_of(guard(external=("n0",)), reading(NOW + 7), reading(NOW + 6), reading(NOW + 8)) == (of_n0, NOW + 6)
+    assert lost_of(guard(external=("n0",)), reading(STEPS - 1)) == (of_n0, STEPS - 1)
+    assert lost_of(guard(external=("n0",)), reading(STEPS), reading(NOW - 1), reading(NOW, y=[1.0, 2.0])) is None
+    assert lost_of(guard(external=("n0",), paced=True), reading(NOW + 7)) is None
+    assert lost_of(guard(), change("y", step=NOW + 7)) is None  # the plant keeps it
+
+
+def test_what_found_no_room_before_the_run_is_known_to_be_lost_when_it_begins() -> None:
+    for external, lost in (((), None), (("n0",), (measurement("n0"), 6))):
+        made = Guard()
+        made.know(GAINS.problem)
+        assert lost_of(made, reading(7), reading(6)) is None
+        made.begin(steps=6, external=external, paced=False)
+        assert made.lost() is None
+        made.begin(steps=7, external=external, paced=False)
+        assert made.lost() == lost
 
 
 def test_a_flood_of_topics_names_and_sessions_takes_no_memory() -> None:

@@ -15,12 +15,13 @@ from typing import Any
 import pytest
 from made_recordings import observer_gains, real_problem
 from places import ROOT
-from runs import PATIENCE, logged, run_here
+from runs import MANY, PATIENCE, logged, run_here
 
 from agent.authority import Authority
-from agent.contract.errors import Interrupted
+from agent.contract.errors import Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.rights import everybody
+from agent.network.session import CAPACITY
 from designer.replay import replay
 
 SENSOR = ROOT / "docs" / "sensor.py"
@@ -73,6 +74,25 @@ def test_sensor_that_has_nothing_to_say(tmp_path: Path) -> None:
     script.write_text(text.replace(reading, '"y": [0.5] if json.loads(mode)["step"] % 3 else []'))
     measured = measured_by(script, tmp_path / "gains.json", tmp_path / "run.mcap", node="n1", steps=30)
     assert measured == [(k, [0.5] if k % 3 else []) for k in range(30)]
+
+
+def test_a_sensor_that_is_too_far_ahead_breaks_the_run_with_a_sentence(
+    pair_path: Path, tmp_path: Path, pair: Gains
+) -> None:
+    """It reads a file, say, and has sent more than anybody keeps before the run begins; nobody waits for the rest."""
+    name, script, token = pair.problem.node_names[0], tmp_path / "sensor.py", "    ready = "
+    text = SENSOR.read_text()
+    assert text.count(token) == 1
+    ahead = f"""    for step in range({2 * CAPACITY + 1}):
+        y = json.dumps({{"step": step, "y": [0.0]}})
+        session.put(f"{{base}}/node/{{node}}/measurement", y, congestion_control=zenoh.CongestionControl.BLOCK)
+"""
+    script.write_text(text.replace(token, ahead + token))
+    said = (
+        rf'(the recorder|node "{name}") has no room for step \d+ of node/{name}/measurement: {CAPACITY} messages wait'
+    )
+    with pytest.raises(RunBroken, match=said):
+        measured_by(script, pair_path, tmp_path / "run.mcap", node=name, steps=MANY)
 
 
 def test_a_forgotten_external_is_warned_of(pair_path: Path, tmp_path: Path, pair: Gains) -> None:

@@ -11,8 +11,9 @@ import pytest
 
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
-from agent.contract.keys import COORDINATOR, RECORDER
-from agent.contract.messages import Acknowledged, Control, Mode, Ready
+from agent.contract.keys import COORDINATOR, RECORDER, measurement
+from agent.contract.messages import Acknowledged, Control, Measurement, Mode, Ready
+from agent.guard import FLOOD, Unfit
 from agent.network.bus import Bus
 from agent.network.configuration import Network
 from agent.network.words import ChannelClosed, Duty, Incoming, Orphaned, Peer, Refused, Replayed, RunClosed, Sample
@@ -155,3 +156,19 @@ def test_who_publishes_or_acknowledges_has_come_to_that_step(node: Bus, recorder
         assert node.guard.now == now
     recorder.acknowledge(CLOSED.model_copy(update={"steps": 5000}))
     assert recorder.guard.now == 5000
+
+
+def test_a_run_ends_with_a_sentence_where_a_reading_is_lost_for_good(node: Bus, gains: Gains) -> None:
+    """Its node would wait for it until others lose patience. Who leaves already does not need it."""
+    name = gains.problem.node_names[0]
+    topic = measurement(name)
+    node.guard.know(gains.problem)
+    node.guard.begin(steps=9, external=(name,), paced=False)
+    with pytest.raises(Unfit, match=f"^{FLOOD}$"):
+        node.guard.turn_away(topic, Measurement(step=3, y=[0.0]).encode(), None)
+    with pytest.raises(RunBroken, match=rf'^node "n0" has no room for step 3 of {topic}: 8192 messages wait there; a '):
+        node.receive()
+    node._house_due = 0.0
+    door(node).hear(CLOSED)
+    node._forget(CLOSED)
+    assert node.wait_for_close() == CLOSED
