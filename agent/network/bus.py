@@ -15,22 +15,20 @@ What roles talk to. What makes it lose nothing:
   ask for it again;
 * when a run ends, nobody who is well leaves before the recorder has closed the recording.
 
-`session` is the door to zenoh, `configuration` what zenoh is told, `words` what waits for the main thread.
+`session` is the door to zenoh, `configuration` what zenoh is told, `words` what waits for the main thread, `hearing`
+how it gets there. `housekeeping` is what is seen to meanwhile, `replays` who may ask again, `ending` how all part.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import suppress
 from importlib.metadata import version
 from threading import Thread
 from types import FrameType, TracebackType
-from typing import Self, TypeVar
-
-from pydantic import ValidationError
+from typing import Self
 
 from agent.contract.errors import Interrupted, PeakmeshError, RunBroken
 from agent.contract.keys import (
@@ -60,21 +58,23 @@ from agent.contract.messages import (
     Word,
     tag_of,
 )
-from agent.guard import FLOOD, MISNUMBERED, OVERSIZED, UNREADABLE, Guard, Unfit
+from agent.guard import MISNUMBERED, Guard, Unfit
 from agent.network.barrier import REASON_SECONDS, Barrier
 from agent.network.configuration import Network
+from agent.network.ending import CLOSE_SECONDS, Ending
 from agent.network.gate import Gate
+from agent.network.hearing import Hearing
+from agent.network.housekeeping import Housekeeping
 from agent.network.outbox import Outbox
+from agent.network.replays import Replays
 from agent.network.session import CAPACITY, Session
 from agent.network.words import (
     ChannelClosed,
-    Duty,
     Ignored,
     Incoming,
     Namesake,
     Peer,
     Refused,
-    Replayed,
     RunClosed,
     Sample,
     Words,
@@ -82,23 +82,11 @@ from agent.network.words import (
 from agent.plan import LARGEST_WINDOW
 from agent.signals import Handler, Handlers, heed, restore
 
-# Seconds of silence that end a wait. Silence, because on a busy machine everything takes long, but goes on.
-REPLAY_SECONDS = 5.0  # the recorder's, for what it asks for at the end
-CLOSE_SECONDS = 30.0  # everybody else's, for the recorder to close, as long as it is there
-LEAVE_SECONDS = 5.0  # for the others to have gone, or to say why they went
-FAREWELL_SECONDS = 2.0  # for the recorder to have our messages, for who is asked to go while the run goes on
+# Seconds
 EXCUSE_SECONDS = 2.0  # for the coordinator to be there, for who cannot take part
 THREAD_SECONDS = 5.0  # for a thread to end once the session is closed
 GREET_SECONDS = 3.0  # how long who joins a run under way waits for the recorder
 ASK_SECONDS = 0.15  # and asks again
-HOUSE_SECONDS = 0.5  # between two looks after the queues
-BUSY_SECONDS = 0.01  # where one of them was filling
-TELL_SECONDS = 1.0  # between two words on what was refused
-LONGEST_WORD = 1 << 20  # bytes
-MOST_POSTPONED = 64  # requests for replay
-
-T = TypeVar("T")
-Said = TypeVar("Said", Control, Acknowledged, Joining, Leaving, Ready, Refusals)
 
 
 class Bus:
@@ -118,16 +106,12 @@ class Bus:
     ) -> None:
         """`session` opens the door to zenoh, `signals` asks for those that end a program; a simulation has its own."""
         self.run, self.who, self.network = run, who, network
-        self._words = Words(who, meanwhile=self._keep_house)
+        self._words = Words(who, meanwhile=self._meanwhile)
         self.guard = Guard()  # whoever knows the problem tells it
-        self._gates: list[Gate] = []
-        self._house_due = self._told = 0.0  # when to look after the house; when we last told what was refused
-        self._reported = 0  # messages that we have told of
+        self._house = Housekeeping(who, self.guard, tell=lambda word: self._say(refusals(who), word))
+        self._replays = Replays(self.guard, self._words)
+        self._ending = Ending(self._words, self._replays)
         self._word = 0  # number of our next word
-        self._postponed: list[Duty] = []  # requests for replay that cannot be answered yet
-        self._unanswered: Counter[str] = Counter()  # requests for replay, by whom they were made to
-        self._leaving = False  # a signal then changes nothing: we go as soon as all is recorded
-        self._last_word: Acknowledged | None = None  # that the recording is closed
         self._ready: Ready | None = None  # what we have told the coordinator
         self.has_begun = False  # the run, for us
         self.is_over = False  # what would be published now would not be recorded
@@ -199,45 +183,30 @@ class Bus:
     def channel(self, topic: str) -> Gate:
         """Receive a topic's messages; what does not fit does not come in."""
         gate = Gate(self._session.channel(topic), self.guard, for_record=self.who == RECORDER)
-        self._gates.append(gate)
+        self._house.gates.append(gate)
         return gate
 
     def advertise(self, topics: Iterable[str]) -> None:
         """Announce that these topics will be published, and offer replays of them."""
-        self._session.offer_replay(self.who, self._outbox.since, is_for=self._may_ask)
+        self._session.offer_replay(self.who, self._outbox.since, is_for=self._replays.may_ask)
         for topic in topics:
             express = model_of(topic) is Estimate  # the only message that somebody waits for right now
             self._session.advertise(topic, express=express)
 
-    def _may_ask(self, by: str, question: Duty) -> bool | None:
-        """Whether a session is the recorder's; None where it will be when the one before it is known to have gone."""
-        if self.guard.trusts(RECORDER, by) or not self.guard.is_there(RECORDER, by):
-            return self.guard.trusts(RECORDER, by)
-        if len(self._postponed) == MOST_POSTPONED:
-            return False
-        self._postponed.append(question)
-        return None
-
-    def _ask_again(self) -> Ignored:
-        """Somebody else is the recorder now: what was postponed is asked once more."""
-        postponed, self._postponed = self._postponed, []
-        for question in postponed:
-            self._words.put(question)
-        return Ignored()
-
     def enter(self) -> None:
         """Receive what runs the run, watch the others' tokens, and show our own: the last declaration."""
+        listen = Hearing(self._session, self.guard).listen
         self._session.watch(self._see)  # first: who says something has shown its token before
         if self.who in (COORDINATOR, RECORDER):
-            self._listen(ready("*"), Ready)
+            listen(ready("*"), Ready)
         if self.who == COORDINATOR:
-            self._listen(joining("*"), Joining)
-            self._listen(leaving("*"), Leaving)
-            self._listen(refusals("*"), Refusals)
+            listen(joining("*"), Joining)
+            listen(leaving("*"), Leaving)
+            listen(refusals("*"), Refusals)
         else:
-            self._listen(CONTROL, Control, heed=self._heed_cast)
+            listen(CONTROL, Control, heed=self._heed_cast)
         if self.who != RECORDER:
-            self._listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
+            listen(ACKNOWLEDGED, Acknowledged, heed=self._forget)
         self._session.listen(refused(self.who, self._session.identity), self._refuse, overflow=lambda: None)
         self._session.appear(self.who)
 
@@ -253,7 +222,7 @@ class Bus:
         elif (is_alone := self.guard.went(who, session)) is not None:
             self._words.put(lambda: Peer(who, not is_alone, succeeds=not is_alone))
             if who == RECORDER:
-                self._words.put(self._ask_again)
+                self._words.put(self._replays.ask_again)
 
     def _refuse(self, sentence: bytes) -> Ignored:
         """Our place is taken, says a namesake; nobody can say so who is not there.
@@ -282,32 +251,13 @@ class Bus:
     def _place_is_taken(self) -> Refused:
         return Refused(f'{in_words(self.who)} takes part in run "{self.run}" already; start it once')
 
-    def _listen(self, topic: str, model: type[Said], *, heed: Callable[[Said], None] = lambda word: None) -> None:
-        name = topic.partition("/")[0]
-
-        def decode(payload: bytes) -> Said | Ignored:
-            try:
-                if len(payload) > LONGEST_WORD:
-                    raise Unfit(OVERSIZED)
-                word = model.model_validate_json(payload)
-                self.guard.admit_word(_speaker(word), name, word, second=not isinstance(word, Acknowledged | Control))
-                heed(word)
-                return word
-            except ValidationError:
-                self.guard.refuse(name, UNREADABLE)
-            except Unfit as unfit:
-                self.guard.refuse(name, unfit.kind)
-            return Ignored()
-
-        self._session.listen(topic, decode, overflow=lambda: self.guard.refuse(name, FLOOD))
-
     def _forget(self, acknowledged: Acknowledged) -> None:
         """What the recorder has need not be kept. Raises Unfit where it says that it has more than was sent."""
         received = acknowledged.received.get(self.who, 0)
         if received > self._outbox.number and self._outbox.has_sent:
             raise Unfit(MISNUMBERED)
         self._outbox.forget(received)
-        self._last_word = acknowledged if acknowledged.closed else None
+        self._ending.last_word = acknowledged if acknowledged.closed else None
 
     # Start together; `barrier` has the rest.
     def meet(self, others: Iterable[str], *, warn: Callable[[str], None] = lambda sentence: None) -> Iterator[str]:
@@ -396,12 +346,12 @@ class Bus:
         """
         deadline = time.monotonic() + timeout
         while True:
-            word = self._noted(self._words.next(min(deadline, self._given_up)))
+            word = self._replays.noted(self._words.next(min(deadline, self._given_up)))
             if time.monotonic() >= self._given_up:
                 raise RunBroken(f"the coordinator was lost, and did not come back within {self.network.wait:g} s")
             match word:
                 case Control(order="close" | "stop"):
-                    self._tell_refused()
+                    self._house.tell_refused()
                     raise RunClosed(word)
                 case Namesake(identity=identity):
                     self._heed_namesake(identity)
@@ -456,7 +406,7 @@ class Bus:
 
     def request_replay(self, who: str, *, first: int) -> None:
         """Ask `who` for its messages from number `first` on: they come as samples, then Replayed(who)."""
-        self._unanswered[who] += 1
+        self._replays.asked(who)
         self._session.request_replay(who, first=first, seconds=CLOSE_SECONDS)
 
     def _say(self, topic: str, word: Word) -> None:
@@ -465,45 +415,21 @@ class Bus:
         self._word += 1
         self._session.say(topic, signed.model_dump_json().encode())
 
-    # Meanwhile.
-    def _keep_house(self) -> float:
-        """See that no queue of zenoh's is full, and tell the coordinator what was refused; when to do so again.
-
-        RunBroken where the run cannot go on for want of what had no room.
-        """
-        now = time.monotonic()
-        if now < self._house_due:
-            return self._house_due
-        fullest = max((gate.relieve() for gate in self._gates), default=0)
-        if (lost := self.guard.lost()) is not None and not self._leaving:
+    def _meanwhile(self) -> float:
+        """Keep house; when to do so again. RunBroken where the run cannot go on for want of what had no room."""
+        due = self._house.keep()
+        if (lost := self.guard.lost()) is not None and not self._ending.has_begun:
             topic, step = lost
             raise RunBroken(
                 f"{in_words(self.who)} has no room for step {step} of {topic}: {CAPACITY} messages wait there; "
                 f"a sensor must not be more than {LARGEST_WINDOW} steps ahead of the mode"
             )
-        self._house_due = now + (HOUSE_SECONDS if fullest < CAPACITY // 8 else BUSY_SECONDS)
-        if now >= self._told + TELL_SECONDS:
-            self._told = now
-            self._tell_refused()
-        return self._house_due
+        return due
 
-    def _tell_refused(self) -> None:
-        """Tell the coordinator what we have refused, where there is something new."""
-        total = self.guard.total
-        if total > self._reported and self.who != COORDINATOR:
-            self._reported = total
-            self._say(refusals(self.who), Refusals(who=self.who, counts=self.guard.refused()))
-
-    # End together.
+    # End together; `ending` has the rest.
     def replayed(self, whos: Iterable[str]) -> Iterator[Sample]:
-        """Samples that are still to come, until everybody in `whos` has answered every request for replay.
-
-        Every one: what answers an earlier request may have left before what the last one is about was published.
-        """
-        names = list(whos)
-        for word in self._until(lambda: not any(self._unanswered[who] for who in names), silence=REPLAY_SECONDS):
-            if isinstance(word, Sample):
-                yield word
+        """Samples that are still to come, until everybody in `whos` has answered every request for replay."""
+        return self._ending.replayed(whos)
 
     def wait_for_close(self, heed: Callable[[Incoming | None], None] = lambda word: None) -> Acknowledged | None:
         """Answer replays until the recorder has closed the recording; None where it has not.
@@ -511,67 +437,27 @@ class Bus:
         In a paced run the recorder may just be on its way back; the coordinator, whose end it is, knows. `heed` gets
         what is heard meanwhile.
         """
-        keepers, present = {RECORDER, COORDINATOR} if self.patient else {RECORDER}, self._words.present
-        for word in self._until(lambda: self._last_word is not None or not keepers & present, silence=CLOSE_SECONDS):
-            heed(word)
-        return self._last_word
+        return self._ending.wait_for_close({RECORDER, COORDINATOR} if self.patient else {RECORDER}, heed)
 
     def wait_until_recorded(self) -> None:
-        """Publish nothing more, and stay until the recorder has what we have published; but not for long.
-
-        Nobody else keeps it, and the recorder may just be on its way back, to ask for it.
-        """
-        self.is_over, deadline = True, time.monotonic() + FAREWELL_SECONDS
-        for _ in self._until(lambda: not self.unrecorded or time.monotonic() >= deadline, silence=FAREWELL_SECONDS):
-            pass
+        """Publish nothing more, and stay until the recorder has what we have published; but not for long."""
+        self.is_over = True
+        self._ending.wait_until_recorded(lambda: not self.unrecorded)
 
     def wait_until_there(self, whos: Iterable[str]) -> None:
         """Wait for those who have not been seen yet; but not for long, for they may be gone."""
-        names, present = set(whos), self._words.present
-        for _ in self._until(lambda: names <= present, silence=GREET_SECONDS):
-            pass
+        self._ending.wait_until_there(whos)
 
     def wait_until_gone(self, whos: Iterable[str], *, greet: Callable[[], None] = lambda: None) -> None:
-        """Stay until they have gone, so that our last word is sure to have reached them; but not for long.
-
-        Whoever comes only now is told it by `greet`.
-        """
-        names, present = set(whos), self._words.present
-        for word in self._until(lambda: not names & present, silence=LEAVE_SECONDS):
-            if isinstance(word, Peer) and word.present and word.who in names:
-                greet()
-
-    def _until(self, condition: Callable[[], bool], *, silence: float) -> Iterator[Incoming | None]:
-        """What comes until the condition holds, or for `silence` seconds nothing has come; None as from `take`."""
-        self._leaving = True
-        while not condition():
-            before = self._words.taken
-            word = self._noted(self._words.take(time.monotonic() + silence))
-            if self._words.taken == before:
-                return
-            yield word
-
-    def _noted(self, word: Incoming | None) -> Incoming | None:
-        if isinstance(word, Replayed):
-            self._unanswered[word.who] -= 1
-        return word
+        """Stay until they have gone, but not for long; whoever comes only now is told our last word by `greet`."""
+        self._ending.wait_until_gone(whos, greet)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._words.put(lambda: self._interrupt(number))
 
     def _interrupt(self, number: int) -> None:
-        if not self._leaving:
+        if not self._ending.has_begun:
             raise Interrupted(number)
-
-
-def _speaker(word: Said) -> str:
-    """Who says such a word."""
-    match word:
-        case Ready() | Refusals() | Joining() | Leaving():
-            return word.who
-        case Acknowledged():
-            return RECORDER
-    return COORDINATOR
 
 
 def _raise(error: BaseException) -> None:

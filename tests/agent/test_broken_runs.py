@@ -36,7 +36,7 @@ from agent.contract.gains import Gains
 from agent.contract.keys import MODE
 from agent.contract.recording.reader import RecordingReader
 from agent.launch import RECORDER_SECONDS
-from agent.network.bus import CLOSE_SECONDS
+from agent.network.ending import CLOSE_SECONDS
 from designer.replay import replay
 
 

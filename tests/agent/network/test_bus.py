@@ -17,11 +17,13 @@ from agent.contract.errors import InputError, Interrupted, RunBroken
 from agent.contract.keys import CONTROL, COORDINATOR, MODE, PLANT, RECORDER
 from agent.contract.messages import Acknowledged, Control, Mode, Word
 from agent.guard import FORGED, OVERSIZED, REPEATED, UNREADABLE
-from agent.network import barrier, bus
+from agent.network import barrier, ending
 from agent.network.addresses import NONE
-from agent.network.bus import LONGEST_WORD, REPLAY_SECONDS, Bus
+from agent.network.bus import Bus
 from agent.network.configuration import Network
+from agent.network.ending import REPLAY_SECONDS
 from agent.network.gate import Admitted
+from agent.network.hearing import LONGEST_WORD
 from agent.network.words import ChannelClosed, Incoming, Peer, Refused, Replayed, RunClosed, Sample
 
 
@@ -118,7 +120,7 @@ def test_the_next_recorder_is_answered_once_the_one_before_is_gone(coordinator: 
             while following._words.take(time.monotonic() + PATIENCE) != Peer(COORDINATOR, True):
                 pass
             following.request_replay(COORDINATOR, first=1)
-            while not coordinator._postponed:
+            while not coordinator._replays.postponed:
                 coordinator._words.take(time.monotonic() + 0.01)
         assert coordinator.receive(timeout=PATIENCE) == Peer(RECORDER, True, succeeds=True)
         answer(coordinator)
@@ -171,7 +173,7 @@ def test_whoever_asks_for_a_replay_gives_up_in_silence_alone(
         return words.pop(0)
 
     recorder.request_replay(COORDINATOR, first=0)
-    monkeypatch.setattr(bus, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(ending, "time", SimpleNamespace(monotonic=lambda: now))
     monkeypatch.setattr(recorder._words, "take", take)
     found = list(recorder.replayed([COORDINATOR]))
     if gap < REPLAY_SECONDS:

@@ -127,7 +127,7 @@ def test_the_end_of_a_paced_run_waits_for_a_recorder_on_its_way_back(node: Bus, 
         node.receive()
     door(node).do(lambda: node._forget(CLOSED))
     assert node.wait_for_close() == (CLOSED if patient else None)
-    node._last_word = None
+    node._ending.last_word = None
     door(node).hear(Peer(COORDINATOR, False))
     assert node.wait_for_close() is None
 
@@ -168,7 +168,6 @@ def test_a_run_ends_with_a_sentence_where_a_reading_is_lost_for_good(node: Bus, 
         node.guard.turn_away(topic, Measurement(step=3, y=[0.0]).encode(), None)
     with pytest.raises(RunBroken, match=rf'^node "n0" has no room for step 3 of {topic}: 8192 messages wait there; a '):
         node.receive()
-    node._house_due = 0.0
     door(node).hear(CLOSED)
     node._forget(CLOSED)
     assert node.wait_for_close() == CLOSED
