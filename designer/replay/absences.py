@@ -36,18 +36,23 @@ class Absences(NamedTuple):
         columns: Columns,
         said: Said,
         void: Void,
+        gaps: Void,
         *,
         external: tuple[bool, ...],
         steps: int,
         plant_is_whole: bool,
         resumed: bool,
     ) -> Self:
-        """`resumed`: a coordinator has come back. For `plant_is_whole` see `excused`."""
+        """`gaps` are numbers that are not there, of a file in which the recorder does not say what became of them.
+
+        `resumed`: a coordinator has come back. For `plant_is_whole` see `excused`.
+        """
         lost = went_with(topics, columns, void, steps)
         return cls(
             excused(topics, columns, said, external, steps, plant_is_whole=plant_is_whole),
             lost,
-            untold(topics, columns, void, steps, memory=said.memory),
+            untold(topics, columns, void, steps, memory=said.memory)
+            | untold(topics, columns, gaps, steps, memory=said.memory),
             perhaps_sent(columns, said, lost, resumed=resumed),
         )
 
@@ -112,7 +117,7 @@ def went_with(topics: Mapping[str, Topic], columns: Columns, void: Void, steps: 
 
 
 def untold(topics: Mapping[str, Topic], columns: Columns, void: Void, steps: int, *, memory: int) -> Flags:
-    """(steps, n): about when a node may have given reasons that went with its process, by the recorder's account."""
+    """(steps, n): about when a node may have given reasons that are not there: under one of the `void` numbers."""
     estimates = [topic for topic in topics.values() if topic.topic.endswith("/estimate")]
     found: Flags = np.zeros((steps, len(estimates)), dtype=bool)
     for i, topic in enumerate(estimates):

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +160,7 @@ def _log(
     steps = min(last + 1, expected)
     _refuse_hollow(columns, steps, content.messages, path=reader.path)
     evidence = content.examiner.finish(end)
-    absences = content.absences(end, expected)
+    absences = content.absences(end, expected, finished=finished)
     census = take_census(
         topics.values(),
         columns,
@@ -259,6 +260,7 @@ class _Content:
         self._unreadable = Sentences()
         self.others: Counter[str] = Counter()  # topics that this problem does not have
         self._events, self._keys = array("q"), array("q")  # numbers of events, and what tells one from another
+        self._beside: defaultdict[str, list[int]] = defaultdict(list)  # the same numbers, of each node
         self._kinds: set[str] = set()  # of the coordinator's events
 
     def read(self, messages: Iterable[Logged]) -> None:
@@ -293,8 +295,9 @@ class _Content:
         if event.who == COORDINATOR:
             self._kinds.add(event.kind)
         self.said.add(event)
-        self._count(logged)
-        return event.step, event.who if self.said.is_node(event.who) else COORDINATOR
+        who = event.who if self.said.is_node(event.who) else COORDINATOR
+        self._count(logged, who)
+        return event.step, who
 
     def _account(self, logged: Logged) -> tuple[int, str]:
         try:
@@ -304,12 +307,13 @@ class _Content:
             self._unreadable.add(f"{ACCOUNT}, number {logged.number}: {words}")
             return -1, ""
         self.said.account(account)
-        self._count(logged)
+        self._count(logged, account.who)
         return account.step, account.who
 
-    def _count(self, logged: Logged) -> None:
+    def _count(self, logged: Logged, who: str) -> None:
         """A message that has a number and no row of its own."""
         self._events.append(logged.number)
+        self._beside[who].append(logged.number)
         self._keys.append(hash((logged.publish_time, logged.payload)))
 
     def refusals(self) -> list[str]:
@@ -389,7 +393,7 @@ class _Content:
         found = {key.removeprefix("void."): ranges_of(text) for key, text in end.items() if key.startswith("void.")}
         return found if self.is_paced else {}
 
-    def absences(self, end: dict[str, str], steps: int) -> Absences:
+    def absences(self, end: dict[str, str], steps: int, *, finished: bool) -> Absences:
         """Why messages are not there."""
         steps = len(self.columns["has"][:steps])
         if not self.is_paced:
@@ -401,11 +405,22 @@ class _Content:
             self.columns,
             self.said,
             void,
+            {} if finished else self._gaps(),
             external=self._external,
             steps=steps,
             plant_is_whole=str(accounted) == end.get(f"received.{PLANT}", "0"),
             resumed="resumed" in self._kinds,
         )
+
+    def _gaps(self) -> dict[str, list[range]]:
+        """Of each node, the numbers before its last that are not there; what a cut file lacks, nothing else tells."""
+        found = {}
+        for who, i in self.said.nodes.items():
+            place = 2 + 2 * i
+            numbers = self.columns["number"][self.columns["has"][:, place], place].tolist()
+            there = sorted({-1, *numbers, *self._beside[who]})
+            found[who] = [range(a + 1, b) for a, b in pairwise(there) if b - a > 1]
+        return found
 
 
 def _strangers(reader: RecordingReader, others: Counter[str]) -> list[str]:

@@ -44,6 +44,7 @@ from agent.roles import coordinator, node, suffering, timekeeper
 from designer.replay import absences, replay
 from designer.replay.absences import excused
 from designer.replay.coupling import Coupling
+from designer.replay.log import _Content
 
 SEEDS, BLOCK = 200, 25
 GAINS = random_gains(random_problem(5, ny=(1, 2, 1), modes=2))
@@ -157,8 +158,13 @@ def _reasons_are_never_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(absences, "untold", lambda *run, memory: untold(*run, memory=memory) & False)
 
 
+def _a_file_that_was_cut_lacks_no_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Content, "_gaps", lambda content: {})
+
+
 FOUND = {
     244: _what_is_lost_was_made_as_the_seed_says,
+    541: _a_file_that_was_cut_lacks_no_reasons,
     685: _the_recorder_has_no_word_on_what_is_lost,
     749: _a_start_for_everybody_who_hears_it,
     1543: _reasons_are_never_lost,

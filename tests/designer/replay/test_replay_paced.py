@@ -522,6 +522,22 @@ def test_a_cut_file_agrees_as_far_as_it_goes(tmp_path: Path, cut: int) -> None:
     assert verdict.pacing.unexplained_total > 0
 
 
+@pytest.mark.parametrize(("topic_ends", "field", "after"), [("measurement", "measured", 0), ("estimate", "heard", 1)])
+def test_a_reason_that_a_cut_file_lacks_was_perhaps_given(
+    tmp_path: Path, topic_ends: str, field: str, after: int
+) -> None:
+    """A number is not there, as where the recorder was killed before it came; where all are there, nobody gave it."""
+    at, node, _, _ = reason(topic_ends)
+    event = TRUE[at]
+    lacking = [*TRUE[:at], *TRUE[at + 1 :]]
+    silent = [m._replace(number=m.number - (m.who == event.who and m.number > event.number)) for m in lacking]
+    facts: dict[str, Any] = {"steps": STEPS, "whole": False, "period": "0.1"}
+    verdict = replay(record(tmp_path / "lacking.mcap", HIDDEN, lacking, **facts))
+    assert (verdict.agrees, verdict.exit_code) == (True, 3), verdict.text()
+    verdict = replay(record(tmp_path / "silent.mcap", HIDDEN, silent, **facts))
+    assert_found(verdict, step=min(event.document["steps"]) + after, node=node, field=field, proof=1)
+
+
 def test_a_file_without_events_explains_nothing_and_accuses_nobody(tmp_path: Path) -> None:
     sent = [m for m in faulty(HIDDEN) if m.topic not in ("event", "account")]
     verdict = verdict_of(tmp_path, sent)

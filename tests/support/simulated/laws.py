@@ -82,7 +82,7 @@ def the_replay_agrees(outcome: Outcome) -> Iterator[str]:
 
     Where messages are lost with the process that held them, which the other laws allow of few, a replay cannot know
     what others did with them, or why they had none: then it accuses nobody, but need not find that all is there. Nor
-    can it know of a run that ended badly what was lost.
+    does it accuse anybody of what a run that ended badly has not recorded.
     """
     if not files_of(outcome.recording):
         return
@@ -92,7 +92,7 @@ def the_replay_agrees(outcome: Outcome) -> Iterator[str]:
         yield f"the replay ends in {type(error).__name__}: {error}"
         return
     if outcome.unrecorded:
-        if outcome.summary is not None and verdict.outcome == "diverges":
+        if verdict.outcome == "diverges":
             yield f"messages are lost, and the replay accuses: {verdict.text()}"
         return
     if verdict.first_divergence is not None:
