@@ -274,18 +274,8 @@ def analyse(
 def certified(problem: Problem, given: GivenGains) -> Gains:
     """A gains file of the given gains, with a certificate of their exact gain; or Unattainable."""
     certificate = certify(problem, given.K, given.H)
-    return with_worst_case(
-        Gains(
-            problem=problem,
-            problem_digest=problem.digest(),
-            method="given",
-            K=given.K,
-            H=given.H,
-            certificate=certificate,
-            solver=Solver(name="none", version="-", status="the gains were given", iterations=0, seconds=0.0),
-            seconds={"total": 0.0},
-        )
-    )
+    solver = Solver(name="none", version="-", status="the gains were given", iterations=0, seconds=0.0)
+    return with_worst_case(Gains.of(problem, given.K, given.H, method="given", certificate=certificate, solver=solver))
 
 
 def _vector(u: Array) -> str:

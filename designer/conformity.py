@@ -72,16 +72,7 @@ def _consensus(problem: Problem) -> Gains:
     K, H = link_gains(problem, *consensus_gains(problem))
     nothing = Certificate(gamma=1.0, kind="lyapunov", form="full", holds=False, verified="nothing", margins={})
     solver = Solver(name="none", version="0", status="consensus gains", iterations=0, seconds=0.0)
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
-        method="consensus",
-        K=K,
-        H=H,
-        certificate=nothing,
-        solver=solver,
-        seconds={"total": 0.0},
-    )
+    return Gains.of(problem, K, H, method="consensus", certificate=nothing, solver=solver)
 
 
 NETWORKS = {  # from what the paper has to what real networks have; the last has all of it

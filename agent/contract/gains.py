@@ -111,6 +111,30 @@ class Gains(Model):
     worst_case: Matrix | None = None  # (steps, nw), energy 1: the worst fixed w, where the problem asks for it
 
     @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        *,
+        method: str,
+        certificate: Certificate,
+        solver: Solver,
+        **seconds: float,
+    ) -> Self:
+        """New gains for a problem; `seconds` are of each phase in which they were made."""
+        return cls(
+            problem=problem,
+            problem_digest=problem.digest(),
+            method=method,
+            K=K,
+            H=H,
+            certificate=certificate,
+            solver=solver,
+            seconds=seconds | {"total": sum(seconds.values(), 0.0)},
+        )
+
+    @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a gains.json. Raises InputError for a file that is missing, cut, foreign or edited."""
         return cls.from_bytes(read_bytes(Path(path), kind="gains file"), source=str(path))

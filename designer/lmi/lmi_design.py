@@ -47,15 +47,15 @@ def design_by_lmi(problem: Problem, method: str) -> Gains:
         why = f"gains that ignore all measurements, because {error}"
         solver = Solver(name="none", version="-", status=why, iterations=0, seconds=time.perf_counter() - started)
     ended = time.perf_counter()
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
+    return Gains.of(
+        problem,
+        K,
+        H,
         method=method,
-        K=K,
-        H=H,
         certificate=_certificate(problem, confirmed, lmi_gamma=lmi_gamma),
         solver=solver,
-        seconds={"solve": ended - started - certify, "certify": certify, "total": ended - started},
+        solve=ended - started - certify,
+        certify=certify,
     )
 
 

@@ -34,12 +34,11 @@ def design_baseline(problem: Problem, method: str) -> Gains:
     except Unattainable as error:
         raise Unattainable(f"{method} is no method for {problem.name}: {error}; --method exact searches") from None
     ended = time.perf_counter()
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
+    return Gains.of(
+        problem,
+        K,
+        H,
         method=method,
-        K=K,
-        H=H,
         certificate=certificate,
         solver=Solver(
             name="none, numpy",
@@ -48,5 +47,6 @@ def design_baseline(problem: Problem, method: str) -> Gains:
             iterations=0,
             seconds=solved - started,
         ),
-        seconds={"solve": solved - started, "certify": ended - solved, "total": ended - started},
+        solve=solved - started,
+        certify=ended - solved,
     )

@@ -111,12 +111,11 @@ def design_exact(
     certificate = to_its_end(lambda: certify(problem, K, H, gain=gain))
     certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
     ended = time.perf_counter()
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
+    return Gains.of(
+        problem,
+        K,
+        H,
         method=method,
-        K=K,
-        H=H,
         certificate=certificate,
         solver=Solver(
             name="barrier descent, numpy",
@@ -125,12 +124,9 @@ def design_exact(
             iterations=steps,
             seconds=solved - begun,
         ),
-        seconds={
-            "starts": begun - started,
-            "solve": solved - begun,
-            "certify": ended - solved,
-            "total": ended - started,
-        },
+        starts=begun - started,
+        solve=solved - begun,
+        certify=ended - solved,
     )
 
 

@@ -140,15 +140,13 @@ def random_gains(problem: Problem, seed: int = 0) -> Gains:
 
 def uncertified(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, method: str) -> Gains:
     """Gains of which nothing is proved."""
-    return Gains(
-        problem=problem,
-        problem_digest=problem.digest(),
+    return Gains.of(
+        problem,
+        K,
+        H,
         method=method,
-        K=K,
-        H=H,
         certificate=Certificate(gamma=1.0, kind="lyapunov", form="full", holds=False, verified="nothing", margins={}),
         solver=Solver(name="none", version="0", status="none", iterations=0, seconds=0.0),
-        seconds={"total": 0.0},
     )
 
 
