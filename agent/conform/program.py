@@ -9,16 +9,15 @@ import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
-from typing import Self
 
+from agent.contract.closing import Closing
 from agent.contract.errors import InputError
 from agent.guests import Program
 
 LAST_LINES = 3  # of what it has said, that are told
 
 
-class Running:
+class Running(Closing):
     """A program in a session of its own. `ended` is called with its exit code, on a thread."""
 
     def __init__(self, program: Program, *, ended: Callable[[int], None]) -> None:
@@ -54,11 +53,3 @@ class Running:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._watch.join()
         self._said.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from agent.contract.closing import Closing
 from agent.contract.errors import first_fault
 from agent.contract.keys import (
     ACCOUNT,
@@ -62,7 +62,7 @@ class Ended(NamedTuple):
 Heard = Came | Gone | Garbled | Ended | Sample | Joining | Ready | Leaving | Replayed
 
 
-class Stage:
+class Stage(Closing):
     """Use it with `with`. `hand_over` and `have` may be called by any thread, the rest by one."""
 
     def __init__(self, run: str, node: str) -> None:
@@ -78,14 +78,6 @@ class Stage:
             leaving(self._who): Leaving,
         }
         self._session.collect([estimate(node), EVENT, ACCOUNT, *self._models])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Leave, all at once: links and tokens are gone."""

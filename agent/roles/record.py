@@ -6,9 +6,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
+from agent.contract.closing import Closing
 from agent.contract.errors import InputError, RecordingFailed
 from agent.contract.gains import Gains
 from agent.contract.keys import EVIDENCE, decode, model_of, sender_of
@@ -28,7 +28,7 @@ class Held(NamedTuple):
     messages: int = 0
 
 
-class Record:
+class Record(Closing):
     """A recording that is being written.
 
     Where that fails, `failure` says why; from then on there are receipts for what comes, but nothing is written.
@@ -187,11 +187,3 @@ class Record:
         if writer is not None:
             with self._failing():
                 writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -9,9 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from agent.contract.closing import Closing
 from agent.contract.errors import InputError, counted
 from agent.contract.gains import Gains
 from agent.contract.recording import Logged, contents, records
@@ -27,7 +26,7 @@ NAMED = 3  # so many damages are told, the others counted
 Progress = Callable[[int, int], None]  # bytes read, of all
 
 
-class RecordingReader:
+class RecordingReader(Closing):
     """Reads a recording, whole or cut, in one file or in several that hold parts of one run.
 
     `run` and `gains` are there at once; `end` is None where the run's last word is missing. What is wrong with the
@@ -195,14 +194,6 @@ class RecordingReader:
     def close(self) -> None:
         for source in self._sources:
             source.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def runs_of(path: Path) -> list[Run]:

@@ -14,11 +14,11 @@ import struct
 import time
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from mcap.writer import CompressionType, Writer
 
+from agent.contract.closing import Closing
 from agent.contract.errors import RecordingFailed, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.keys import model_of
@@ -41,7 +41,7 @@ class Split(NamedTuple):
     seconds: float | None = None
 
 
-class RecordingWriter:
+class RecordingWriter(Closing):
     """Writes a recording, part by part. Not thread-safe.
 
     Every method raises RecordingFailed where the disk is full or fails, or the file is gone; what was written stays,
@@ -124,14 +124,6 @@ class RecordingWriter:
     def close(self) -> None:
         """Let go of the file; without `finish` it stays `.part`, cut but readable."""
         self._part.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class _Part:

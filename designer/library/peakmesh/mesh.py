@@ -9,8 +9,9 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
+from agent.contract.closing import Closing
 from agent.contract.errors import EXIT_GOOD, EXIT_INPUT, InputError, RunBroken
 from agent.contract.gains import Gains
 from peakmesh.answers import Name, replay
@@ -26,7 +27,7 @@ GRACE = 5.0  # seconds for a run to end well after a function has failed: it may
 FAREWELL = 60.0  # seconds for a run to end in order, before it is killed
 
 
-class Mesh:
+class Mesh(Closing):
     """A whole network on this machine, from its start to the end of a `with` block; no process or thread is left.
 
     `run` is its name and `address` where its coordinator listens: what a sensor, `peakmesh watch` or `live` is told.
@@ -95,12 +96,6 @@ class Mesh:
     def close(self) -> None:
         """End what has not ended."""
         self._stack.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _started(self, arguments: dict[str, Any]) -> subprocess.Popen[bytes]:
         """In a session of its own, so that Ctrl-C reaches it through us alone."""
