@@ -32,7 +32,7 @@ from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
 from designer.ladder import Ladder, interval
 from designer.lmi import beyond_paper
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import model_of_gains
 from designer.proof.prover import Prover
 from designer.search.exact_design import SLOW, certify, confirmed, lower_end
 
@@ -228,7 +228,7 @@ def analyse(
     from designer.lmi.multipliers import least_of_lmi  # loads a solver, which reading gains does not take
 
     refuse_nothing_to_estimate(problem)
-    model = error_model(problem, *stacked_links(problem, given.K, given.H))
+    model = model_of_gains(problem, given.K, given.H)
     gain = exact_gain(model)
     exact = (gain.low, gain.high) if gain.stable else None
     least = floor(problem)

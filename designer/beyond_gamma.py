@@ -15,7 +15,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import node_gains
 from designer.gain.noise import SteadyState, steady_state
 from designer.ladder import rounded_up
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import model_of_gains
 from designer.start import FromStart, from_start
 from designer.start import told as from_there
 
@@ -53,7 +53,7 @@ class BeyondGamma(NamedTuple):
 
 def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | None = None) -> BeyondGamma:
     """For any gains, with the P that their certificate stores; nothing where they are not mean-square stable."""
-    model = error_model(problem, *stacked_links(problem, K, H))
+    model = model_of_gains(problem, K, H)
     noise = steady_state(model, initial=problem.mode_index(problem.markov.initial))
     small = problem.n * problem.nx <= _MOST_STATES
     return BeyondGamma(

@@ -14,7 +14,7 @@ from designer.box.extent import Box
 from designer.box.robust import robust
 from designer.gain.noise import steady_state
 from designer.ladder import rounded_up
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import model_of_gains
 from designer.search.exact_design import certify
 from designer.synthesis import design, design_in_box, methods
 
@@ -76,7 +76,7 @@ def _of_method(problem: Problem, method: str, box: Box | None) -> Rank:
 
 
 def _noise(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> float | None:
-    model = error_model(problem, *stacked_links(problem, K, H))
+    model = model_of_gains(problem, K, H)
     found = steady_state(model, initial=problem.mode_index(problem.markov.initial))
     return None if found is None else found.total
 

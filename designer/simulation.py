@@ -36,7 +36,7 @@ from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, Dist
 from designer.gain.exact import Operator
 from designer.gain.noise import steady_state
 from designer.gain.start import left_by_start
-from designer.model.error_model import error_model, measurement_slices, stacked_gains
+from designer.model.error_model import error_model, measurement_slices, model_of_gains, stacked_gains
 from designer.workers import each
 
 CONFIDENCE = 0.99  # that the intervals of all steps hold at once
@@ -188,7 +188,7 @@ def simulate(
 
 def steady(gains: Gains) -> float | None:
     """What E|z_tilde|^2 comes to under the problem's white noise; None: there is none, or the errors do not settle."""
-    problem, model = gains.problem, error_model(gains.problem, *stacked_gains(gains))
+    problem, model = gains.problem, model_of_gains(gains.problem, gains.K, gains.H)
     if not isinstance(problem.disturbance, White):
         return None
     found = steady_state(model, initial=problem.mode_index(problem.markov.initial))

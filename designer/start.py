@@ -17,7 +17,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.start import corners, is_many, left_by_start
 from designer.ladder import rounded_up
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import model_of_gains
 from designer.single_run import single_run_of
 
 
@@ -37,7 +37,7 @@ def from_start(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | No
     """None where the problem has no initial error. `P`: what the certificate stores; without it, one is made."""
     if problem.plant.initial_error is None:
         return None
-    gamma = exact_gain(error_model(problem, *stacked_links(problem, K, H))).high
+    gamma = exact_gain(model_of_gains(problem, K, H)).high
     known = single_run_of(problem, K, H, gamma, P) if math.isfinite(gamma) else None
     gamma_P, V = (None, None) if known is None else (known[0], value_of(problem, known[1]))
     return FromStart(left_by_start(problem, K, H), gamma_P, V)

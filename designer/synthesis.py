@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from agent.contract.errors import InputError, Unattainable, listed
@@ -12,17 +13,18 @@ from agent.contract.gains import Certificate, Gains
 from agent.contract.problem import Problem
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box
+from designer.coordinates import Coordinates
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
-from designer.model.error_model import error_model, stacked_gains
+from designer.model.error_model import model_of_gains
 from designer.model.units import NaturalUnits
 from designer.proof.certificate import lyapunov_matrix
 from designer.proof.prover import Prover
 from designer.search.baselines import BASELINES, design_baseline
-from designer.search.descent import Budget, Progress
+from designer.search.descent import Budget, Progress, to_its_end
 from designer.search.effort import BUDGET, default_method
 from designer.search.exact_design import certify, confirmed, design_exact, lower_end
 
@@ -113,9 +115,28 @@ def _exact_in_natural_units(
 ) -> Gains:
     """The same gains whatever the units: a problem in other powers of two of them is the same one, number by number.
 
-    So what is proved of one is proved of the other; of small networks it is proved again.
+    Where M cancels, z itself is a state in the search; if that leads nowhere, as where what z is made of grows and
+    sensors hardly tell it apart, the states are those of the problem after all.
     """
-    natural = NaturalUnits(problem)
+    coordinates, limit = Coordinates.of(problem), Budget(budget)
+    if coordinates is not None:
+        with suppress(Unattainable):
+            return _searched(problem, NaturalUnits(problem, coordinates), limit, progress, dask, slack)
+    return _searched(problem, NaturalUnits(problem), limit, progress, dask, slack)
+
+
+def _searched(
+    problem: Problem,
+    natural: NaturalUnits,
+    budget: Budget,
+    progress: Callable[[Progress], None] | None,
+    dask: str | None,
+    slack: float,
+) -> Gains:
+    """What is proved in natural units is proved of the problem that was given; of small networks it is proved again.
+
+    In other coordinates gains are rounded on the way back, so there all is found again.
+    """
     unit, tell = natural.output, progress
     if progress is not None and unit != 1.0:
 
@@ -123,11 +144,16 @@ def _exact_in_natural_units(
             noise = None if at.noise is None else unit**2 * at.noise
             progress(at._replace(gamma=unit * at.gamma, noise=noise))
 
-    gains = design_exact(natural.problem, budget=Budget(budget), progress=tell, dask=dask, unit=unit, slack=slack)
+    gains = design_exact(
+        natural.problem, budget=budget, progress=tell, dask=dask, unit=unit, slack=slack, held=natural.held
+    )
     K, H = natural.back(gains.K, gains.H)
     certificate = _in_units_of(gains.certificate, unit)
     small = problem.n * problem.nx <= _PROVED_STATES
-    if small and not Prover(problem, K, H).exact(certificate.gamma).holds:  # numbers near the ends of float64
+    if natural.coordinates is not None:
+        compared = {"lmi_gamma": certificate.lmi_gamma, "lmi_exact": certificate.lmi_exact}
+        certificate = to_its_end(lambda: certify(problem, K, H)).model_copy(update=compared)
+    elif small and not Prover(problem, K, H).exact(certificate.gamma).holds:  # numbers near the ends of float64
         certificate = certify(problem, K, H)
     update = {"problem": problem, "problem_digest": problem.digest(), "K": K, "H": H, "certificate": certificate}
     return gains.model_copy(update=update)
@@ -151,7 +177,7 @@ def _with_exact(gains: Gains) -> Gains:
     if problem.n * problem.nx > _LADDER_STATES:
         return gains
     started = time.perf_counter()
-    gain = exact_gain(error_model(problem, *stacked_gains(gains)))
+    gain = exact_gain(model_of_gains(problem, gains.K, gains.H))
     exact = gain.bounds
     found: dict[str, object] = {"exact": exact}
     if exact is not None and exact[1] < certificate.gamma:

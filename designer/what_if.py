@@ -20,7 +20,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.ladder import percent, rounded_up
 from designer.lmi.back_off import least_gamma
-from designer.model.error_model import StackedGains, error_model, stacked_gains, stacked_links
+from designer.model.error_model import StackedGains, error_model, model_of_gains, stacked_gains, stacked_links
 from designer.proof.certificate import lyapunov_matrix
 from designer.search.descent import NEAR
 from designer.search.effort import default_method
@@ -219,11 +219,11 @@ def _bound_for(whole: Gains, rest: Problem) -> float:
     problem = whole.problem
     if rest.n == problem.n:
         return whole.certificate.gamma
-    model = error_model(problem, *stacked_gains(whole))
     kept = np.repeat([name in rest.node_names for name in problem.node_names], problem.nz)
     if whole.certificate.kind == "exact":
+        model = model_of_gains(problem, whole.K, whole.H)
         return exact_gain(replace(model, M=model.M[kept])).high
-    return least_gamma(model.M[kept], lyapunov_matrix(whole))
+    return least_gamma(error_model(problem, *stacked_gains(whole)).M[kept], lyapunov_matrix(whole))
 
 
 def _gains_left(whole: Gains, rest: Problem) -> StackedGains:

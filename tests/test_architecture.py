@@ -48,13 +48,15 @@ ROOMS = {
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",
     # the mathematics
+    "designer.coordinates": "",
     "designer.decay": "",
-    "designer.model": "",
-    "designer.gain": "designer.decay designer.model",
-    "designer.proof": "designer.decay",
+    "designer.model": "designer.coordinates",
+    "designer.gain": "designer.coordinates designer.decay designer.model",
+    "designer.proof": "designer.coordinates designer.decay",
     "designer.lmi": "designer.gain designer.model designer.proof",
     "designer.workers": "",
-    "designer.search": "designer.decay designer.gain designer.lmi designer.model designer.proof designer.workers",
+    "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
+    "designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
@@ -62,8 +64,8 @@ ROOMS = {
     "designer.start": "designer.gain designer.ladder designer.model designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
     "designer.box": "designer.decay designer.gain designer.ladder designer.model designer.proof designer.search",
-    "designer.synthesis": "designer.box designer.diagnosis designer.gain designer.lmi designer.model designer.proof "
-    "designer.search",
+    "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
+    "designer.model designer.proof designer.search",
     "designer.stacked": "designer.model",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.lmi designer.model designer.proof designer.search designer.stacked",

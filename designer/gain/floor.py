@@ -19,6 +19,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 
 _SETTLED = 1e-12
 _MOST_STEPS = 10_000
@@ -34,6 +35,8 @@ def floor(problem: Problem) -> float:
     give A S v + B w, so S_(k+1) = [A S, B] N with N an orthonormal basis of the kernel of [C S, D]. That is the
     Riccati equation with w shared by plant and sensors, and needs no inverse of D D'. C is beta_i C_i where hidden.
     """
+    coordinates = Coordinates.of(problem)
+    problem = problem if coordinates is None else coordinates.problem
     plant = problem.plant
     C = np.vstack([node.C if node.seen else node.arrival_probability * node.C for node in problem.nodes])
     D = np.vstack([node.D for node in problem.nodes])

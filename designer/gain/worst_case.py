@@ -14,7 +14,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem.disturbance import WorstCase
 from designer.gain.exact import Operator
 from designer.gain.sensitivity import critical, critical_sweep
-from designer.model.error_model import ErrorModel, error_model, realised, stacked_gains
+from designer.model.error_model import ErrorModel, model_of_gains, realised
 
 _SETTLED = 1e-4  # twice the horizon adds less to the worst gain, relatively
 _MOST_ROWS = 256  # of the largest matrix whose eigenvalues are sought, T nw: about a second
@@ -79,7 +79,7 @@ def worst_disturbance(model: ErrorModel, *, initial: int, horizon: int) -> Distu
 def worst_for(gains: Gains) -> Disturbance:
     """The worst fixed w of gains from their initial mode."""
     problem = gains.problem
-    return worst_fixed(error_model(problem, *stacked_gains(gains)), initial=problem.mode_index(problem.markov.initial))
+    return worst_fixed(model_of_gains(problem, gains.K, gains.H), initial=problem.mode_index(problem.markov.initial))
 
 
 def worst_fixed(model: ErrorModel, *, initial: int) -> Disturbance:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 
 Indices = NDArray[np.intp]
 StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) of (8)
@@ -238,6 +239,17 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
         rows=bar.rows,
         links=_link_terms(problem, bar, K_bar, H_bar, R, p),
     )
+
+
+def model_of_gains(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> ErrorModel:
+    """`error_model` of gains by links, for what does not depend on the coordinates of the states, such as a gain.
+
+    Where M cancels, eta = [T x; T e_1; ...; T e_n], of which it does not: designer.coordinates.
+    """
+    coordinates = Coordinates.of(problem)
+    if coordinates is None:
+        return error_model(problem, *stacked_links(problem, K, H))
+    return error_model(coordinates.problem, *stacked_links(coordinates.problem, *coordinates.there(K, H)))
 
 
 def initial_eta(problem: Problem) -> Array:

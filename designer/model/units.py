@@ -6,16 +6,17 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import CONTINUOUS
+from designer.coordinates import Coordinates, reached
 from designer.model.error_model import ErrorModel
 
-_DOUBLINGS = 20  # 2^20 terms of the sum of A^k B B' A'^k
-_DAMPED = 0.95
 _FEW = 8
+_MOST = 2.0**30  # times 2^-53: by so much of itself z may move as gains are rounded
 _STEPS_OF_SCALE = 8
 
 
@@ -30,18 +31,14 @@ class Units(NamedTuple):
 def natural_units(problem: Problem) -> Units:
     """State units that a w of unit energy can reach and no more; the output unit that makes M near 1 in them.
 
-    An unstable plant can be brought anywhere: its A is taken with less weight, as if its spectral radius were 0.95.
-    A state keeps its unit where w cannot reach it, or so far that it overflows: rounding can do that near radius 1.
+    As `reached` has it, for an unstable plant too. A state keeps its unit where w cannot reach it, or so far that it
+    overflows: rounding can do that near radius 1.
     n errors share what R has for one state, so Q_i is of the order R/n and delta of the order n. Networks of more than
     _FEW nodes have errors in larger units, so that Q_i and delta are those of _FEW: of 200 nodes the solver takes 24
     steps in place of 31.
     """
-    radius = problem.plant.spectral_radius
-    gramian, power = problem.plant.B @ problem.plant.B.T, problem.plant.A * (_DAMPED / radius if radius >= 1.0 else 1.0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(_DOUBLINGS):
-            gramian, power = gramian + power @ gramian @ power.T, power @ power
-        reach = np.sqrt(np.diag(gramian))
+    with np.errstate(invalid="ignore"):
+        reach = np.sqrt(np.diag(reached(problem)))
     state = np.where((reach > 0.0) & np.isfinite(reach), reach, 1.0)
     error = math.sqrt(max(problem.n / _FEW, 1.0))
     return Units(state, float(np.linalg.norm(problem.plant.M * state, 2)) or 1.0, error)
@@ -67,10 +64,13 @@ class NaturalUnits:
     """The problem with states, measurements and z in powers of two of their units, in which they are near 1.
 
     So it is the same problem, number by number, and gains go to and fro without rounding: whatever is found in these
-    units does not depend, by a single bit, on the powers of two that somebody measures in.
+    units does not depend, by a single bit, on the powers of two that somebody measures in. Where M cancels, that is so
+    of the problem in other `coordinates`, and to get there takes a rounding.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, coordinates: Coordinates | None = None) -> None:
+        self.coordinates, self.held = coordinates, None
+        given, problem = problem, problem if coordinates is None else coordinates.problem
         self.state = _power(natural_units(problem).state)
         self.y = [
             _power(np.hypot(np.linalg.norm(node.C * self.state, axis=1), np.linalg.norm(node.D, axis=1)))
@@ -83,9 +83,13 @@ class NaturalUnits:
             for node, y in zip(scaled.nodes, self.y, strict=True)
         ]
         self.names, self.problem = problem.node_names, scaled.model_copy(update={"nodes": tuple(nodes)})
+        if coordinates is not None:
+            self.held = _held(coordinates, natural_units(given).state, self.state)
 
     def there(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
         """Gains of the problem that was given, in the units of `problem`."""
+        if self.coordinates is not None:
+            K, H = self.coordinates.there(K, H)
         rows, y = 1.0 / self.state[:, None], {name: 1.0 / y for name, y in zip(self.names, self.y, strict=True)}
         x = dict.fromkeys(self.names, 1.0 / self.state)
         return _divided(K, rows, x), _divided(H, rows, y)
@@ -94,7 +98,19 @@ class NaturalUnits:
         """Gains of `problem`, in the units of the problem that was given."""
         rows, y = self.state[:, None], dict(zip(self.names, self.y, strict=True))
         x = dict.fromkeys(self.names, self.state)
-        return _divided(K, rows, x), _divided(H, rows, y)
+        K, H = _divided(K, rows, x), _divided(H, rows, y)
+        return (K, H) if self.coordinates is None else self.coordinates.back(K, H)
+
+
+def _held(coordinates: Coordinates, given: Array, state: Array) -> NDArray[np.bool_]:
+    """Entries (nx, nx) of K_ij in these coordinates, (T K_ij T^-1)_ab, that no file could hold if they were near 1.
+
+    Back among the states they are large numbers, as they multiply what cancels; rounded, they would move z by more
+    than is left of it. `given` and `state`: natural units there and here.
+    """
+    columns = np.abs(coordinates.inverse.astype(np.float64)).T / given  # of T^-1
+    left, right = state * columns.max(axis=1), (np.abs(coordinates.T) * given).max(axis=1) / state
+    return np.asarray(np.outer(left, right) * right.max() > _MOST)
 
 
 def _divided(gains: LinkMatrices, rows: Array, by: dict[str, Array]) -> LinkMatrices:

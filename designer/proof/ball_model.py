@@ -16,7 +16,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from flint import arb, arb_mat
+from flint import arb, arb_mat, fmpq, fmpq_mat
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
@@ -81,9 +81,19 @@ class Sensor(NamedTuple):
 
 
 class BallModel:
-    """[A B] and the noise of every mode, M, and the chain; eta = [x; e_1; ...; e_n], or e alone where x drops out."""
+    """[A B] and the noise of every mode, M, and the chain; eta = [x; e_1; ...; e_n], or e alone where x drops out.
 
-    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
+    With T (nx, nx) it is all of [T x; T e_1; ...; T e_n] in the end: of the same errors, whatever regular T it is.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        truth: Truth | None = None,
+        T: Array | None = None,
+    ) -> None:
         nx, n = problem.nx, problem.n
         self.truth = truth or told(problem)
         self.real = self.truth.matrices or matrices_of(problem)
@@ -109,6 +119,51 @@ class BallModel:
             self.AB.append(arb_mat(self.size, self.size + self.nw))
             self.filled.append(np.zeros((self.size, self.size + self.nw), dtype=bool))
             self.noise.append(self._mode(problem, s, K, H))
+        if T is not None:
+            self._turn(T)
+
+    def _turn(self, T: Array) -> None:
+        """To T x and T e_i; `sensors` and `carried`, which only boxes ask for, stay as they are."""
+        there, back = exact(T), _inverse(T)
+        self.M = self._blocks(self.M, None, back)
+        for s in self.modes:
+            self.AB[s] = self._blocks(self.AB[s], there, back)
+            self.filled[s] = np.array([not entry.is_zero() for entry in self.AB[s].entries()]).reshape(
+                self.filled[s].shape
+            )
+            self.noise[s] = [self._turned(noise, there, back) for noise in self.noise[s]]
+
+    def _turned(self, noise: Noise, there: arb_mat, back: arb_mat) -> Noise:
+        """E is the identity where a whole message is lost, and then stays it: what T makes small is C."""
+        C = noise.C * self._along(noise.columns, back)
+        if noise.loss:
+            return noise._replace(E=self._along(noise.rows, there) * noise.E, C=C)
+        return noise._replace(C=there * C)
+
+    def _blocks(self, matrix: arb_mat, left: arb_mat | None, right: arb_mat) -> arb_mat:
+        """Every block of nx columns of eta times `right`, of nx rows from the left by `left`, if there are such."""
+        nx = right.nrows()
+        turned, blocks = (
+            arb_mat(matrix.nrows(), matrix.ncols()),
+            [self.eta[k : k + nx] for k in range(0, self.size, nx)],
+        )
+        all_rows = [list(range(matrix.nrows()))] if left is None else blocks
+        for rows in all_rows:
+            for columns in [*blocks, list(range(self.size, matrix.ncols()))]:
+                block = part(matrix, rows, columns)
+                if columns and not _is_zero(block):
+                    block = block * right if columns[0] < self.size else block
+                    add(turned, rows, columns, block if left is None else left * block)
+        return turned
+
+    def _along(self, places: list[int], block: arb_mat) -> arb_mat:
+        """`block` for every x or e_i among these places of [eta; w], and the identity for w."""
+        nx, whole = block.nrows(), identity(len(places))
+        for a, i in enumerate(places):
+            for b, j in enumerate(places):
+                if i // nx == j // nx and max(i, j) < self.size:
+                    whole[a, b] = block[i % nx, j % nx]
+        return whole
 
     def _add(self, s: int, rows: list[int], columns: list[int], block: arb_mat) -> None:
         add(self.AB[s], rows, columns, block)
@@ -243,6 +298,12 @@ class BallModel:
             AB_rows = part(AB, rows, columns)
             add(S, columns, columns, AB_rows.transpose() * (part(Y_bar, rows, rows) * AB_rows))
         return S
+
+
+def _inverse(T: Array) -> arb_mat:
+    """Of floats; ZeroDivisionError where there is none."""
+    rational = [[fmpq(*entry.as_integer_ratio()) for entry in row] for row in T.tolist()]
+    return arb_mat(fmpq_mat(rational).inv())
 
 
 def _is_zero(matrix: arb_mat) -> bool:

@@ -22,10 +22,12 @@ class ByBalls:
 
     cost = 200.0
 
-    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, *, bits: int) -> None:
+    def __init__(
+        self, problem: Problem, K: LinkMatrices, H: LinkMatrices, *, bits: int, T: Array | None = None
+    ) -> None:
         self.bits, self.name = bits, f"ball arithmetic of {bits} bits (flint {flint.__version__})"
         with ctx.workprec(bits):
-            self.model = BallModel(problem, K, H)
+            self.model = BallModel(problem, K, H, T=T)
         self.order = self.model.size
         self.unknowns = len(self.model.AB) * self.order * (self.order + 1) // 2  # entries of Y in all modes
 

@@ -26,9 +26,17 @@ class ByFloats:
     cost = 1.0
     spreads = False  # about one model, of which S(Y) is linear in Y
 
-    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        truth: Truth | None = None,
+        *,
+        T: Array | None = None,
+    ) -> None:
         with ctx.workprec(BITS):
-            self._begin(BallModel(problem, K, H, truth))
+            self._begin(BallModel(problem, K, H, truth, T))
 
     def _begin(self, balls: BallModel) -> None:
         self.model = FloatModel(balls)

@@ -13,12 +13,13 @@ from typing import NamedTuple
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
 from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_leaps, recursion
 
-Make = Callable[[Problem, LinkMatrices, LinkMatrices], Arithmetic]
+Make = Callable[..., Arithmetic]  # of a problem, K and H, and T
 
 FLOATS: tuple[Make, ...] = (ByFloats,)
 BALLS: tuple[Make, ...] = tuple(partial(ByBalls, bits=bits) for bits in (128, 256, 512, 1024))
@@ -54,7 +55,10 @@ class Stability(NamedTuple):
 
 
 class Prover:
-    """P (modes, n_eta, n_eta), of which (P + P')/2 counts; without one, it is found here. `makes`: whom to ask."""
+    """P (modes, n_eta, n_eta), of which (P + P')/2 counts; without one, it is found here. `makes`: whom to ask.
+
+    P is of [T x; T e_1; ...]. Without P, T is chosen here too: where M cancels, so that it does not.
+    """
 
     def __init__(
         self,
@@ -63,9 +67,12 @@ class Prover:
         H: LinkMatrices,
         *,
         P: Array | None = None,
+        T: Array | None = None,
         makes: Sequence[Make] = FLOATS + BALLS,
     ) -> None:
         self._problem, self._K, self._H, self._given, self._makes = problem, K, H, P, makes
+        chosen = Coordinates.of(problem) if P is None and T is None else None
+        self._T = T if chosen is None else chosen.T
         self._made: list[Arithmetic] = []
         self._known: dict[int, list[_Answer]] = {}  # by a P of `_invariants`, which stays
 
@@ -81,7 +88,7 @@ class Prover:
 
     @cached_property
     def _floats(self) -> ByFloats:
-        return ByFloats(self._problem, self._K, self._H)
+        return ByFloats(self._problem, self._K, self._H, T=self._T)
 
     def theorem1(self, gamma: float) -> Verdict:
         """(17) and (18) in every mode."""
@@ -121,8 +128,12 @@ class Prover:
         """
         if most <= _STEPS_BEFORE_LEAPS:
             return self.at_least_by_steps(gamma, most=most)
-        soon = self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
-        return soon or self.at_least_by_leaps(gamma) or self.at_least_by_steps(gamma, most=most)
+        return (
+            self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
+            or self.at_least_by_leaps(gamma)
+            or self.at_least_by_steps(gamma, most=most)
+            or self.at_least_by_steps(gamma, most=_STEPS_OF_DISPROOF)  # in balls too
+        )
 
     def at_least_by_leaps(self, gamma: float) -> str | None:
         """The same where errors decay slowly and are few, by a w = Gamma eta that is held."""
@@ -206,7 +217,8 @@ class Prover:
     def _arithmetic(self, k: int) -> Arithmetic:
         while len(self._made) <= k:
             make = self._makes[len(self._made)]
-            self._made.append(self._floats if make is ByFloats else make(self._problem, self._K, self._H))
+            made = self._floats if make is ByFloats else make(self._problem, self._K, self._H, T=self._T)
+            self._made.append(made)
         return self._made[k]
 
     def _disproof(self, gamma: float) -> list[_Answer]:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
@@ -68,12 +69,19 @@ class Blocks:
 class Barrier:
     """J and what it is made of, for one problem; x = [v; y] holds the gains' entries and y = log g.
 
-    `models`: what the same gains may meet beside the problem itself.
+    `models`: what the same gains may meet beside the problem itself. `held`: as `Entries` takes it.
     """
 
-    def __init__(self, problem: Problem, horizon: int, models: Sequence[Inputs] = ()) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        horizon: int,
+        models: Sequence[Inputs] = (),
+        *,
+        held: NDArray[np.bool_] | None = None,
+    ) -> None:
         self.problem, self.horizon = problem, horizon
-        self.entries, self.inputs = Entries(problem), Inputs(problem)
+        self.entries, self.inputs = Entries(problem, held), Inputs(problem)
         self.models = [self.inputs, *models]
         self.size, self._units = problem.plant_states + problem.n * problem.nx, natural_units(problem).state
         self._nodes, self._moments = self._heard()

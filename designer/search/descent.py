@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
@@ -165,13 +166,16 @@ def descend(
     first: float = math.inf,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
+    held: NDArray[np.bool_] | None = None,
 ) -> Descent:
     """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
+
+    `held`: as `Entries` takes it.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
     returned.
     """
-    search = _Search(problem, Budget() if budget is None else budget, progress)
+    search = _Search(problem, Budget() if budget is None else budget, progress, held)
     ended = "converged"
     try:
         search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
@@ -194,9 +198,15 @@ def follow(problem: Problem, start: StackedGains, weights: tuple[float, ...]) ->
 class _Search:
     """The state of one `descend`, so that it is there when the search is interrupted."""
 
-    def __init__(self, problem: Problem, budget: Budget, progress: Callable[[Progress], None] | None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        budget: Budget,
+        progress: Callable[[Progress], None] | None,
+        held: NDArray[np.bool_] | None = None,
+    ) -> None:
         self.problem, self.budget, self.progress = problem, budget, progress
-        self.barrier, self.longest = Barrier(problem, _HORIZON), longest_horizon(problem)
+        self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable

@@ -17,11 +17,12 @@ class Entries:
     """The entries of K_bar and H_bar that the topologies allow, as one vector, in natural units.
 
     K_ij is in units of x per x and H_ij in units of x per y: a w of unit energy reaches one unit of x. Where gains are
-    unbiased, K_ii is not free: a_ii K_ii = A - sum over j != i of a_ij K_ij.
+    unbiased, K_ii is not free: a_ii K_ii = A - sum over j != i of a_ij K_ij. Entries of K_ij that are `held` (nx, nx)
+    stay 0; they have their places in the vector, where they count for nothing.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, held: NDArray[np.bool_] | None = None) -> None:
+        self.problem, self.held = problem, held
         nx, columns, modes = problem.nx, measurement_slices(problem), len(problem.topologies)
         self.K = np.zeros((modes, problem.n * nx, problem.n * nx), dtype=bool)
         self.H = np.zeros((modes, problem.n * nx, rows_total(problem)), dtype=bool)
@@ -36,7 +37,11 @@ class Entries:
 
     def pack(self, K_bar: Array, H_bar: Array) -> Array:
         """All K entries, then all H entries."""
-        return np.asarray(np.concatenate([K_bar[self.K], H_bar[self.H]]) / self.units)
+        return self.in_units(np.concatenate([K_bar[self.K], H_bar[self.H]]))
+
+    def in_units(self, gains: Array) -> Array:
+        """The vector of such entries."""
+        return np.asarray(np.divide(gains, self.units, out=np.zeros_like(gains), where=self.units > 0.0))
 
     def pack_slope(self, K_bar: Array, H_bar: Array) -> Array:
         """The derivative by the vector, from those by K_bar and H_bar."""
@@ -72,7 +77,10 @@ class Entries:
         """What every entry of K_bar and of H_bar is measured in, and which are free."""
         bar, x = stacks(self.problem), np.tile(natural_units(self.problem).state, self.problem.n)
         y = np.hypot(np.linalg.norm(bar.C * x, axis=1), np.linalg.norm(bar.D, axis=1))
-        return [(x[:, None] / x, self.K), (x[:, None] / np.where(y > 0.0, y, 1.0), self.H)]
+        of_K = x[:, None] / x
+        if self.held is not None:
+            of_K[np.tile(self.held, (self.problem.n, self.problem.n))] = 0.0
+        return [(of_K, self.K), (x[:, None] / np.where(y > 0.0, y, 1.0), self.H)]
 
     def _own(self, K_bar: Array) -> Array:
         """The blocks (i, i), one below the other, (modes, n nx, nx)."""

@@ -7,16 +7,18 @@ import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 from designer.gain.exact import Gain, Operator, exact_gain, lyapunov
 from designer.gain.floor import floor
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
-from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
+from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
 from designer.proof.findings import Verdict
 from designer.proof.prover import FLOATS, MOST_STEPS_BELOW, Prover
 from designer.proof.recursion import MOST_STEPS
@@ -51,6 +53,7 @@ def design_exact(
     dask: str | None = None,
     unit: float = 1.0,
     slack: float = 0.0,
+    held: NDArray[np.bool_] | None = None,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
@@ -58,7 +61,8 @@ def design_exact(
 
     `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
     when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
-    `unit`: of z; it counts in the status alone.
+    `unit`: of z; it counts in the status alone. `held` (nx, nx): entries of K_ij that are to be 0, unless windows are
+    searched.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
@@ -72,7 +76,7 @@ def design_exact(
     own, lmi_gamma, stopped = starts is None, None, False
     if starts is None:
         try:
-            starts, lmi_gamma = _starts(problem)
+            starts, lmi_gamma = _starts(problem, held)
         except KeyboardInterrupt:
             if problem.plant.spectral_radius >= 1.0:
                 raise
@@ -89,7 +93,7 @@ def design_exact(
     if own and in_windows(problem):
         descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
     else:
-        descent = descend(problem, starts, first=first, budget=budget, progress=progress)
+        descent = descend(problem, starts, first=first, budget=budget, progress=progress, held=held)
     descent = descent._replace(ended="interrupted") if stopped else descent
     chosen = descent.chosen
     if not chosen.gain.stable:
@@ -99,7 +103,7 @@ def design_exact(
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
-        found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress)
+        found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress, held=held)
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
         status = f"{_status_of_noise(found, unit)}; before: {status}"
         gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
@@ -151,9 +155,11 @@ def _by_windows(
     return descent._replace(ended=ended) if ended else descent
 
 
-def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
+def _starts(problem: Problem, held: NDArray[np.bool_] | None) -> tuple[dict[str, StackedGains], float | None]:
     """Gains to start from, and gamma of the LMI where that gave one of them."""
-    starts = {"least variance": least_variance_gains(problem)}
+    starts = {"least variance": least_variance_gains(problem, held)}
+    if held is not None and problem.plant.spectral_radius < 1.0:
+        starts["ignoring all measurements"] = ignoring(problem)  # where M cancels, few gains are better
     if lyapunov(Operator(error_model(problem, *starts["least variance"])))[0] is None:
         starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
     if problem.n * problem.nx > _LMI_STATES:
@@ -172,8 +178,12 @@ def _starts(problem: Problem) -> tuple[dict[str, StackedGains], float | None]:
 
 
 def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | None = None) -> Certificate:
-    """gamma just above the exact gain of any gains of (5), proved; or Unattainable. `gain`: where it is known."""
-    gain = exact_gain(error_model(problem, *stacked_links(problem, K, H))) if gain is None else gain
+    """gamma just above the exact gain of any gains of (5), proved; or Unattainable. `gain`: where it is known.
+
+    Where M cancels, what is known of it has too few digits.
+    """
+    if gain is None or Coordinates.of(problem) is not None:
+        gain = exact_gain(model_of_gains(problem, K, H))
     if not gain.stable:
         raise Unattainable(
             f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
@@ -59,15 +60,16 @@ def quieter(
     *,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
+    held: NDArray[np.bool_] | None = None,
 ) -> Found:
     """From gains whose exact gain is below `gamma` to those of least noise, of which it is still below.
 
     KeyboardInterrupt and the end of the budget end the search: the best so far is returned. InputError where the
-    memory does not suffice, or where no noise is left to be made less.
+    memory does not suffice, or where no noise is left to be made less. `held`: as `Entries` takes it.
     """
     if not whole_fits(problem):
         raise InputError(f"{problem.name} is too large for --peak-slack: its {problem.n} nodes are searched at once")
-    search = _Search(problem, gamma * (1.0 - _INSIDE), Budget() if budget is None else budget, progress)
+    search = _Search(problem, gamma * (1.0 - _INSIDE), Budget() if budget is None else budget, progress, held)
     start = search.measured(search.barrier.entries.pack(*gains))
     if start is None or not start.noise > 0.0:
         raise InputError(f"{problem.name}: the noise of gains of least peak has not settled, so none can be compared")
@@ -85,16 +87,21 @@ class _Search:
     """The state of one `quieter`, so that it is there when the search is interrupted."""
 
     def __init__(
-        self, problem: Problem, gamma: float, budget: Budget, progress: Callable[[Progress], None] | None
+        self,
+        problem: Problem,
+        gamma: float,
+        budget: Budget,
+        progress: Callable[[Progress], None] | None,
+        held: NDArray[np.bool_] | None,
     ) -> None:
         self.problem, self.gamma, self.budget, self.progress = problem, gamma, budget, progress
-        self.barrier, self.longest = Barrier(problem, _HORIZON), longest_horizon(problem)
+        self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.y, self.steps = 2.0 * math.log(gamma), 0
         self.found: list[Quiet] = []
 
     def run(self, v: Array) -> None:
         """From v, or from gains of least variance where they do; on longer horizons while this one is too short."""
-        greedy = self.barrier.entries.pack(*least_variance_gains(self.problem))
+        greedy = self.barrier.entries.pack(*least_variance_gains(self.problem, self.barrier.entries.held))
         if self._kept(greedy):
             v = greedy
         while True:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
@@ -126,9 +127,12 @@ def ignoring(problem: Problem) -> StackedGains:
     return np.asarray(K_bar), np.zeros((modes, problem.n * problem.nx, rows))
 
 
-def least_variance_gains(problem: Problem) -> StackedGains:
-    """Gains at which white w leaves each node the least mean square of e_i, given the others' gains."""
-    modes, entries, pattern = len(problem.topologies), Entries(problem), Inputs(problem).pattern
+def least_variance_gains(problem: Problem, held: NDArray[np.bool_] | None = None) -> StackedGains:
+    """Gains at which white w leaves each node the least mean square of e_i, given the others' gains.
+
+    `held`: as `Entries` takes it.
+    """
+    modes, entries, pattern = len(problem.topologies), Entries(problem, held), Inputs(problem).pattern
     batches = _batches(problem, entries)
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
@@ -143,7 +147,7 @@ def least_variance_gains(problem: Problem) -> StackedGains:
         joint[:, :size, :size] = X
         for batch in batches:
             v[batch.at] = batch.best(joint)
-        K_bar, H_bar = entries.unpack(v / entries.units)
+        K_bar, H_bar = entries.unpack(entries.in_units(v))
         operator = Operator(error_model(problem, K_bar, H_bar), pattern)
         operator.transition = chain
         X_next = operator.carry(joint) + fresh
@@ -162,6 +166,7 @@ class _Batch(NamedTuple):
     t: Array  # (m, nx, c)
     mean: Array  # (m, q, c)
     noises: Array  # (m, noises, q, c)
+    free: NDArray[np.bool_]  # (nx, q): which entries of [K H] are
 
     def best(self, joint: Array) -> Array:
         """[K H] = E[t r'] E[r r']^-1, (m, nx q), where [eta; w] has the covariance `joint` in each mode."""
@@ -171,8 +176,12 @@ class _Batch(NamedTuple):
         gram += (self.noises @ cov[:, None] @ self.noises.swapaxes(2, 3)).sum(axis=1)
         sizes = np.diagonal(gram, axis1=1, axis2=2)
         scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
-        inverse = np.linalg.pinv(gram * scale[:, None] * scale[:, :, None], rcond=1e-10, hermitian=True)
-        best = (self.t @ cov @ mean_T * scale[:, None]) @ inverse * scale[:, None]
+        across = self.t @ cov @ mean_T
+        best = np.zeros_like(across)
+        for free in np.unique(self.free, axis=0):  # of what is not free the pseudo-inverse has zeros
+            rows, scaled = (self.free == free).all(axis=1), scale * free
+            inverse = np.linalg.pinv(gram * scaled[:, None] * scaled[:, :, None], rcond=1e-10, hermitian=True)
+            best[:, rows] = (across[:, rows] * scaled[:, None]) @ inverse * scaled[:, None]
         return np.asarray(best.reshape(self.at.shape))
 
 
@@ -187,7 +196,11 @@ def _batches(problem: Problem, entries: Entries) -> list[_Batch]:
         noises: Array = np.array([V[:, c] for V in regression.noises]).reshape(-1, len(regression.mean), len(c))
         parts: tuple[Any, ...] = (at, moments, regression.t[:, c], regression.mean[:, c], noises)
         found.setdefault(tuple(size for part in parts for size in part.shape), []).append(parts)
-    return [_Batch(*map(np.array, zip(*alike, strict=True))) for alike in found.values()]
+    batches = []
+    for alike in found.values():
+        at, moments, t, mean, noises = map(np.array, zip(*alike, strict=True))
+        batches.append(_Batch(at, moments, t, mean, noises, entries.units[at[0]].reshape(problem.nx, -1) > 0.0))
+    return batches
 
 
 class Regression(NamedTuple):

@@ -140,7 +140,7 @@ def test_ctrl_c_in_any_phase_leaves_gains_that_are_certified(phase: str, monkeyp
 
 
 def test_ctrl_c_before_the_search_is_not_called_a_want_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(problem: Problem) -> Any:
+    def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(exact_design, "_starts", interrupted)
