@@ -229,8 +229,8 @@ def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None 
 
     number, of_state = connected_components(moves, connection="strong")
 
-    def of_part(part: Array) -> float:
-        at = np.ix_(range(modes), part, part)
+    def of_part(part: NDArray[np.intp]) -> float:
+        at = np.ix_(np.arange(modes), part, part)
 
         def within(Y: Array) -> Array:
             whole = np.zeros((modes, n, n))

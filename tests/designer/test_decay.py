@@ -95,7 +95,7 @@ def test_a_transient_is_not_growth() -> None:
 
 @pytest.mark.parametrize("own", [0.0, 0.9])
 def test_nor_is_a_long_one(own: float) -> None:
-    """In a line of 64 nodes rounding alone makes eigenvalues above 1 of the whole, and so do 300 steps where own = 0.9."""
+    """In a line of 64 nodes rounding alone makes eigenvalues above 1 of the whole, and so do 300 steps if own = 0.9."""
     problem, K, H = chain([0.5] + 63 * [own - 1.2])
     for i, name in enumerate(problem.node_names[1:], 1):
         K["t"][name] = {problem.node_names[i - 1]: np.array([[1.2]]), name: np.array([[own]])}
