@@ -86,7 +86,7 @@ class Analysis(NamedTuple):
             "designed_for": None if self.given.file is None else self.given.file.problem.name,
             "same_problem": None if self.given.file is None else not self.foreign,
             "stable": self.stable,
-            "radius": self.radius if math.isfinite(self.radius) else None,
+            "radius": self.radius if math.isfinite(self.radius) and self._rate_is_credible else None,
             "exact": self.ladder.exact,
             "unproved": self.unproved,
             "horizon": self.horizon,
@@ -115,6 +115,17 @@ class Analysis(NamedTuple):
             return ""
         return f": {_steps(self.horizon)} {'shows' if self.horizon == 1 else 'show'} that it is no less"
 
+    @property
+    def _rate_is_credible(self) -> bool:
+        """Eigenvalues are in floats; no proof says that these are wrong."""
+        return self.stable is None or self.stable is (self.radius < 1.0)
+
+    def _rate(self, digits: int) -> str:
+        if not self._rate_is_credible:
+            return "how fast in the long run, floats do not tell"
+        rate = f"{self.radius:.{digits}g}" if math.isfinite(self.radius) else "more than a float64 holds"
+        return f"computed: in the long run each step multiplies E|error|^2 by {rate}"
+
     def text(self) -> str:
         """The facts for people."""
         problem, given = self.problem, self.given
@@ -126,11 +137,10 @@ class Analysis(NamedTuple):
                 f"than the one here ({problem.digest()[:12]}...)"
             )
         if self.u is None:
-            growth = f"{self.radius:.9g}" if math.isfinite(self.radius) else "more than a float64 holds"
             known = "NOT mean-square stable, proved: from some start the errors never die out"
             if self.stable is None:
                 known = "it is not known whether the errors are mean-square stable"
-            lines.append(f"{known}; computed: in the long run each step multiplies E|error|^2 by {growth}")
+            lines.append(f"{known}; {self._rate(9)}")
             if self.ladder.floor is None:
                 lines.append("no other gains do better: the sensors do not show an unstable part of the plant")
             return "\n".join(lines)
@@ -146,8 +156,7 @@ class Analysis(NamedTuple):
         if self.unproved is not None:
             lines.append(f"certified  no gamma: {self.unproved}")
         lines += [
-            f"stable     mean-square, {'proved' if self.stable else 'as far as floats tell'}; computed: each step "
-            f"multiplies E|error|^2 by {self.radius:.6g} in the long run",
+            f"stable     mean-square, {'proved' if self.stable else 'as far as floats tell'}; {self._rate(6)}",
             f"exact gain between {interval(low, high)}, {how}{self._shown}",
             f"ladder     {rungs}",
             *([] if self.robust is None else self.robust.lines()),

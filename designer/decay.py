@@ -18,6 +18,7 @@ from functools import cached_property, partial
 from importlib.util import find_spec
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 
@@ -56,8 +57,11 @@ class Decay:
         return self.total is not None and is_positive(self.total)
 
 
-def decay(L: Map, modes: int, units: Array) -> Decay:
-    """Of L on (modes, n, n); `units` (n,): powers of two in which the numbers are near 1, U = diag(units^2)."""
+def decay(L: Map, modes: int, units: Array, moves: NDArray[np.bool_] | None = None) -> Decay:
+    """Of L on (modes, n, n); `units` (n,): powers of two in which the numbers are near 1, U = diag(units^2).
+
+    `moves` (n, n): whether state j ever moves state i, as far as that is known; the radius is the better for it.
+    """
     n, both = len(units), np.outer(units, units)
 
     def scaled(Y: Array) -> Array:
@@ -68,7 +72,7 @@ def decay(L: Map, modes: int, units: Array) -> Decay:
     return Decay(
         None if total is None else total * both,
         None if rest is None else rest * both,
-        partial(spectral_radius, scaled, modes, n),
+        partial(spectral_radius, scaled, modes, n, moves),
     )
 
 
@@ -213,8 +217,32 @@ def _krylov(L: Map, y: Array) -> Array:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def spectral_radius(L: Map, modes: int, n: int) -> float:
-    """Of L; by its eigenvalues, of large ones by Arnoldi's method. Infinite where L overflows."""
+def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None = None) -> float:
+    """Of L; by its eigenvalues, of large ones by Arnoldi's method. Infinite where L overflows.
+
+    Where states move each other in one direction only, as nodes in a line, eigenvalues of the whole are very sensitive
+    to rounding. Those of the parts in which all move all are as many as are needed: what of L takes a part to itself.
+    """
+    if moves is None or modes * n * (n + 1) // 2 <= _FEW or not find_spec("scipy"):
+        return _radius(L, modes, n)
+    from scipy.sparse.csgraph import connected_components
+
+    number, of_state = connected_components(moves, connection="strong")
+
+    def of_part(part: NDArray[np.intp]) -> float:
+        at = np.ix_(np.arange(modes), part, part)
+
+        def within(Y: Array) -> Array:
+            whole = np.zeros((modes, n, n))
+            whole[at] = Y
+            return np.asarray(L(whole)[at])
+
+        return _radius(within, modes, len(part))
+
+    return max(of_part(np.flatnonzero(of_state == k)) for k in range(number))
+
+
+def _radius(L: Map, modes: int, n: int) -> float:
     pack, unpack = _packing(modes, n)
     order = modes * n * (n + 1) // 2
     first = pack(L(np.broadcast_to(np.eye(n), (modes, n, n))))
@@ -228,7 +256,7 @@ def spectral_radius(L: Map, modes: int, n: int) -> float:
         try:
             found = eigs(operator, k=1, v0=first + 1e-30, tol=tol, maxiter=restarts, return_eigenvectors=False)
             radius = float(np.abs(found).max())
-            if order > 2 * _DENSE or not _has_transient(L, modes, n, radius):
+            if not _has_transient(L, modes, n, radius):
                 return radius
         except ArpackError:
             pass

@@ -16,7 +16,7 @@ from designer.box.extent import Box
 from designer.coordinates import Coordinates
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
 from designer.gain.exact import exact_gain
-from designer.gain.floor import floor
+from designer.gain.floor import floor_below
 from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
 from designer.model.error_model import model_of_gains
@@ -74,7 +74,8 @@ def design(
             gains = _with_exact(design_by_lmi(problem, method))
     except Unattainable as error:
         raise explained(problem, error, _solvable) from None
-    certificate = gains.certificate.model_copy(update={"floor": floor(problem), "lmi_least": _least_of_lmi(gains)})
+    least = floor_below(problem, gains.certificate.gamma)
+    certificate = gains.certificate.model_copy(update={"floor": least, "lmi_least": _least_of_lmi(gains)})
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
 
 

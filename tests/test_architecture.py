@@ -79,10 +79,11 @@ ROOMS = {
     "designer.synthesis",
     "designer.simulation": "designer.gain designer.model designer.workers",
     "designer.ledger": "designer.gain designer.model designer.proof",
-    "designer.replay": "agent.contract.recording designer.ledger designer.model designer.proof",
+    "designer.chance": "designer.single_run designer.start",
+    "designer.replay": "agent.contract.recording designer.chance designer.gain designer.ledger designer.model "
+    "designer.proof",
     "designer.identify": "designer.box designer.gain designer.model designer.replay",
-    "designer.report": "designer.beyond_gamma designer.gain designer.ladder designer.model designer.replay "
-    "designer.single_run designer.start",
+    "designer.report": "designer.beyond_gamma designer.chance designer.ladder designer.model designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",

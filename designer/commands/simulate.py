@@ -54,7 +54,9 @@ def simulate_command(options: argparse.Namespace) -> int:
     peak and closest, each with step, mean_square (over runs, of |z_tilde(k)|^2), low and high (its interval), energy
     (of w before the step, in the mean over white noise), bound (gamma^2 energy) and least (what the true mean is at
     least, whatever the distribution): the step of the largest mean, and that where the mean is largest relative to
-    the bound (null where w is 0); gain, the root of mean_square / energy at the closest (null with it); refuted
+    the bound (null where w is 0); start, what the initial error alone leaves of the root of the
+    mean square at most, computed; gain, the root of mean_square / energy at the closest (null with it, or a start);
+    refuted
     (whether `least` is above the bound at some step) and refuted_at (the first such step, or null); single, of the
     largest |z_tilde(k)| in single runs the median, p95 and largest, bound (gamma times the root of all energy) and
     above, how many runs exceed that; seconds; output (the CSV file, or null).
@@ -133,7 +135,9 @@ def _facts(ensemble: Ensemble) -> dict[str, Any]:
         "start": ensemble.start,
         "peak": _step(ensemble, int(np.argmax(ensemble.mean))),
         "closest": None if closest is None else _step(ensemble, closest),
-        "gain": None if closest is None else float(np.sqrt(ensemble.mean[closest] / ensemble.energy[closest])),
+        "gain": None
+        if closest is None or ensemble.start
+        else float(np.sqrt(ensemble.mean[closest] / ensemble.energy[closest])),
         "refuted": ensemble.refuted_at is not None,
         "refuted_at": ensemble.refuted_at,
         "single": {
@@ -160,28 +164,34 @@ def _step(ensemble: Ensemble, k: int) -> dict[str, Any]:
 
 def _text(facts: dict[str, Any]) -> str:
     peak, closest, single = facts["peak"], facts["closest"], facts["single"]
+    root = "gamma sqrt(energy) + start" if facts["start"] else "gamma sqrt(energy)"
+    bound = f"({root})^2" if facts["start"] else "gamma^2 energy"
     last = facts["seed"] + facts["runs"] - 1
     lines = [
         f"{facts['problem']}, {facts['runs']} runs of {facts['steps']} steps, seeds {facts['seed']} to {last}, "
         f"disturbance {facts['disturbance']}, {facts['seconds']:.1f} s",
-        f"peak       {_interval(peak)}",
+        f"peak       {_interval(peak, bound)}",
     ]
     if facts["start"]:
         lines += [f"start      the initial error alone leaves {facts['start']:.6g} of sqrt(E|z~|^2) at most, computed"]
-        lines += ["           so the bound is (gamma sqrt(energy) + that)^2"]
     if facts["steady"] is not None:
         lines += [f"steady     mean |z~|^2 = {facts['steady']:.6g} in the long run, computed from this white noise"]
-    if closest is None:
+    if closest is None and facts["start"]:
+        lines += ["bound      that of the start alone: there is no disturbance"]
+    elif closest is None:
         lines += ["bound      0: no disturbance comes before these steps, and gamma allows for no error without one"]
     else:
         lines += [
-            f"closest    {_interval(closest)}, {_of_bound(closest)}",
+            f"closest    {_interval(closest, bound)}, {_of_bound(closest)}",
+        ]
+    if facts["gain"] is not None:
+        lines += [
             f"gain       {facts['gain']:.6g} there, the root of mean over energy; gamma is {facts['gamma']:.6g}"
             + ("" if facts["claimed"] else ", which the file does not claim"),
         ]
     lines += [
         f"one run    largest |z~|: median {single['median']:.4g}, 95 % below {single['p95']:.4g}, "
-        f"largest {single['largest']:.4g}; gamma sqrt(energy) {single['bound']:.4g}",
+        f"largest {single['largest']:.4g}; {root} {single['bound']:.4g}",
         f"           {single['above']} of {facts['runs']} runs exceed that; they may: gamma bounds the mean over runs",
     ]
     if facts["refuted"]:
@@ -203,10 +213,10 @@ def _of_bound(at: dict[str, Any]) -> str:
     return f"{100.0 * ratio:.1f} % of it" if ratio < 10.0 else f"{ratio:.3g} times as much"
 
 
-def _interval(at: dict[str, Any]) -> str:
+def _interval(at: dict[str, Any], bound: str) -> str:
     return (
         f"mean |z~|^2 = {at['mean_square']:.6g} at step {at['step']}, in [{at['low']:.6g}, {at['high']:.6g}]; "
-        f"gamma^2 energy {at['bound']:.6g}"
+        f"{bound} {at['bound']:.6g}"
     )
 
 

@@ -269,7 +269,7 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
     """
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
-    decays = decay(operator.corner, len(operator.MM), operator.units)
+    decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
     P = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
     if not P:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
@@ -288,7 +288,12 @@ def node_gains(model: ErrorModel) -> list[tuple[float, float]] | None:
     M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable.
     """
     operator = Operator(model)
-    P = invariants(operator.of, decay(operator.corner, model.modes, operator.units), operator.units, operator.MM)
+    P = invariants(
+        operator.of,
+        decay(operator.corner, model.modes, operator.units, operator.model.moves),
+        operator.units,
+        operator.MM,
+    )
     if not P:
         return None
     invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
@@ -382,7 +387,7 @@ def lyapunov(operator: Operator) -> tuple[Array | None, Decay]:
     P0 > 0 with V = P0 - L(P0) > 0 is that of `designer.decay`. By Schur's complement c P0 satisfies (17) if and only if
     I > c (B'P0_bar B + B'P0_bar A V^-1 A'P0_bar B). P is None where floats find no such P0.
     """
-    found = decay(operator.corner, len(operator.MM), operator.units)
+    found = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
     if found.total is None or found.rest is None or not found.dies_out:
         return None, found
     return scaled(operator.of, found.total, found.rest), found

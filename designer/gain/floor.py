@@ -20,8 +20,10 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
+from designer.model.units import NaturalUnits
 
 _SETTLED = 1e-12
+_ROUNDED = 1e-6
 _MOST_STEPS = 10_000
 _DEPENDENT = 1e-10  # a combination of scaled measurements smaller than this is no measurement
 _BOUNDLESS = 1e100  # a detectable plant does not grow by so much
@@ -34,10 +36,10 @@ def floor(problem: Problem) -> float:
     { x(k) : y(0..k-1) = 0, energy of w <= 1 } = { S_k v : |v| <= 1 }. One step: x = S v and w with C S v + D w = 0
     give A S v + B w, so S_(k+1) = [A S, B] N with N an orthonormal basis of the kernel of [C S, D]. That is the
     Riccati equation with w shared by plant and sensors, and needs no inverse of D D'. C is beta_i C_i where hidden.
+    In natural units: what is small beside what depends on them otherwise.
     """
-    coordinates = Coordinates.of(problem)
-    problem = problem if coordinates is None else coordinates.problem
-    plant = problem.plant
+    natural = NaturalUnits(problem, Coordinates.of(problem))
+    problem, plant = natural.problem, natural.problem.plant
     C = np.vstack([node.C if node.seen else node.arrival_probability * node.C for node in problem.nodes])
     D = np.vstack([node.D for node in problem.nodes])
     S, reached = np.zeros((problem.nx, problem.nx)), [0.0]
@@ -57,7 +59,13 @@ def floor(problem: Problem) -> float:
     grows = reached[-1] > _GROWN * reached[len(reached) // 2]
     if not settled and grows and not _detectable(plant.A, C):
         return math.inf
-    return float(np.linalg.norm(problem.weights)) * reached[-1]
+    return natural.output * float(np.linalg.norm(problem.weights)) * reached[-1]
+
+
+def floor_below(problem: Problem, gamma: float) -> float | None:
+    """The floor; None where it is above a gamma that is proved, so that rounding made it."""
+    found = floor(problem)
+    return found if found <= gamma * (1.0 + _ROUNDED) else None
 
 
 def _detectable(A: Array, C: Array) -> bool:

@@ -37,7 +37,7 @@ class SteadyState(NamedTuple):
 def steady_state(model: ErrorModel, *, initial: int) -> SteadyState | None:
     """Of white w with covariance I; r(0) = `initial`. None: not mean-square stable, or not found to SETTLED."""
     operator = Operator(model)
-    decays = decay(operator.corner, model.modes, operator.units)
+    decays = decay(operator.corner, model.modes, operator.units, operator.model.moves)
     if not decays.dies_out:
         return None
     size, both = model.size, np.outer(operator.units, operator.units)

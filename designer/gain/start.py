@@ -27,7 +27,7 @@ def left_by_start(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> float |
     """
     model, s = error_model(problem, *stacked_links(problem, K, H)), problem.mode_index(problem.markov.initial)
     operator = Operator(model)
-    Z = decay(operator.corner, model.modes, operator.units).total
+    Z = decay(operator.corner, model.modes, operator.units, operator.model.moves).total
     if Z is None:
         return None
     try:

@@ -84,6 +84,20 @@ class ErrorModel:
         """The node of each measurement, (sum ny,)."""
         return np.repeat(np.arange(len(self.rows)), [rows.stop - rows.start for rows in self.rows])
 
+    @cached_property
+    def moves(self) -> NDArray[np.bool_]:
+        """Whether state j moves state i, in any mode, by chance or without, (n_eta, n_eta)."""
+        first = self.plant_states
+        moves = np.asarray((self.A != 0.0).any(axis=0))
+        moves[first:] |= (self.H != 0.0).any(axis=0) @ (self.R[:, : self.size] != 0.0)
+        if self.links is not None:
+            nx = self.links.V.shape[1]
+            padded = np.pad(moves, ((0, 0), (0, self.nw)))
+            rows = first + self.links.receiver[:, None] * nx + np.arange(nx)
+            padded[rows[:, :, None], self.links.columns[:, None, :]] = True
+            moves = padded[:, : self.size]
+        return moves
+
     def F_i(self, s: int, i: int) -> Array:
         """Script F_i in full, with the columns of w: (n_eta, n_eta + nw)."""
         full = np.zeros((self.size, self.size + self.nw))

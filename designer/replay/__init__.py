@@ -27,13 +27,14 @@ from numpy.typing import NDArray
 
 from agent.contract.errors import counted
 from agent.contract.problem import Problem
+from designer.chance import Chance, chance
 from designer.ledger.account import Account
 from designer.ledger.deviation import Deviation
 from designer.replay import free_run, proofs
 from designer.replay.census import Place
 from designer.replay.central import Central
 from designer.replay.coupling import Coupling, with_the_plant
-from designer.replay.gamma import checked_gamma
+from designer.replay.gamma import Gamma, checked_gamma
 from designer.replay.inputs import draw, logged_inputs
 from designer.replay.log import Log, load
 from designer.replay.pacing import Pacing
@@ -198,13 +199,17 @@ class Tally:
 
 
 class PathAudit:
-    """Proof 5, gathered block by block. `nw`: numbers in w; one alone makes the bound an equality at step 1."""
+    """Proof 5, gathered block by block. If w is one number, the bound is an equality at step 1.
 
-    def __init__(self, nw: int, part: Part) -> None:
-        self._nw, self._part = nw, part
+    With an initial error it is one at step 0, where that is all there is.
+    """
+
+    def __init__(self, problem: Problem, part: Part) -> None:
+        self._part, self._starts = part, bool(problem.initial_error.any())
+        self._equal_at = 0 if self._starts else 1 if problem.nw == 1 else -1
         self.holds, self.compared = True, 0
         self.margin, self.step = np.inf, -1  # the smallest, and where
-        self.is_equality_at_1 = False  # so that step 1 says nothing, and is not in the margin
+        self.is_equality = False  # in that step, which says nothing, and is not in the margin
         self.silent, self.silent_from = 0, -1  # steps whose rounding may be more than the bound, and the first of them
         self.spoke_again = False  # after that one
 
@@ -219,8 +224,8 @@ class PathAudit:
         self.compared += int(known.sum())
         self.holds &= bool(within[known].all())
         counts = known & (path.bound > 0.0)
-        trivial = counts & within & (steps == 1) & (self._nw == 1)
-        self.is_equality_at_1 |= bool(trivial.any())
+        trivial = counts & within & (steps == self._equal_at)
+        self.is_equality |= bool(trivial.any())
         counts &= ~trivial
         if counts.any():
             margins = 1.0 - path.error[counts] / path.bound[counts]
@@ -235,12 +240,13 @@ class PathAudit:
 
     def note(self) -> str:
         smallest = f"smallest margin {self.margin:.1%}, at step {self.step}"
+        smallest += "; the bound has what x(0) leaves beside it" if self._starts else ""
         if self.silent:
             from_where = f"from step {self.silent_from} on"
             which = f"of {counted(self.silent, 'step')} {from_where}" if self.spoke_again else from_where
             why = f"it says nothing {which}, where rounding may be more than the bound"
             return f"{smallest}; {why}" if self.step >= 0 else why
-        if self.is_equality_at_1:
+        if self.is_equality and self._equal_at == 1:
             why = "at step 1 the bound is an equality, because w is one number"
             return f"{smallest}; {why}" if self.step >= 0 else why
         return smallest if self.step >= 0 else "nothing disturbed the run"
@@ -291,7 +297,7 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report, *, doubts
     if tally.trace is not None and log.has_plant:
         tally.trace.energy_before[:] = energy_before
     block = max(16, min(_STEPS_AT_ONCE, _NUMBERS_AT_ONCE // len(central.model.M) ** 2))
-    audit = PathAudit(log.gains.problem.nw, tally.part)
+    audit = PathAudit(log.gains.problem, tally.part)
     errors = log.error_norms() if coupling is None else coupling.error_norms()
     parts = free_run.free_run(log, central, whole, block=block) if coupling is None else coupling.free_run(block=block)
     for part in parts:
@@ -301,7 +307,8 @@ def _compare(log: Log, central: Central, tally: Tally, report: Report, *, doubts
             path = free_run.path_block(central, part, errors, energy_before)
             audit.add(path, tally.tolerance)
             if tally.trace is not None:
-                tally.trace.path_bound[path.first : path.first + len(path.bound)] = path.bound
+                steps = slice(path.first, path.first + len(path.bound))
+                tally.trace.path_bound[steps], tally.trace.path_start[steps] = path.bound, part.start
     if not log.has_plant:
         return _Compared(None, None, pacing, faults, unknown)
     return _Compared(audit, float(energies.sum()), pacing, faults, unknown)
@@ -317,6 +324,7 @@ def _peak(log: Log) -> Peak | None:
 
 def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
     end, audit, gamma = log.end or {}, compared.audit, checked_gamma(log.gains)
+    ledger = promise(log, gamma, compared.faults)
     return Verdict(
         recording=log.label,
         part=tally.part,
@@ -353,12 +361,20 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         peak=_peak(log),
         energy=compared.energy,
         gamma=gamma,
-        ledger=promise(log, gamma, compared.faults),
+        ledger=ledger,
+        chance=_chance(log, gamma, ledger, compared.energy),
         pacing=compared.pacing,
         path_margin=audit.margin if audit and audit.step >= 0 else None,
         leeway=None if np.isnan(tally.leeway) else tally.leeway,
         up_to=tally.last,
     )
+
+
+def _chance(log: Log, gamma: Gamma, ledger: Account | None, energy: float | None) -> Chance | None:
+    """What single runs keep; None where this is none of them, with faults or with errors that are not known."""
+    if energy is None or ledger is None or not ledger.is_plain:
+        return None
+    return chance(log.gains, steps=log.steps, energy=energy)
 
 
 def _proofs(log: Log, tally: Tally, audit: PathAudit | None, unknown: tuple[Place, ...]) -> Iterator[Proof]:

@@ -34,9 +34,11 @@ MOST_DIVERGENCES = 10_000  # that are written one by one; the others are counted
 OF_STEP = {
     "error": "|z~(k)|, over all nodes, in the units of z",
     "gamma_path": "the gain from the recorded w to z~(k), with the recorded modes, losses and deliveries",
-    "path_bound": "gamma_path(k) sqrt(energy): proof 5 says that the error stays below it; in the units of z",
+    "path_bound": "gamma_path(k) sqrt(energy), and what the initial error leaves of this run's error: proof 5 says "
+    "that the error stays below it; in the units of z",
     "margin": "1 - error / path_bound: what is left of the bound",
-    "mean_bound": "gamma sqrt(energy): bounds the root mean square over many runs, not this one; in the units of z",
+    "mean_bound": "gamma sqrt(energy), and what an initial error leaves: bounds the root mean square over many runs, "
+    "not this one; in the units of z",
     "energy": "sum over j < k of |w(j)|^2, in the units of w squared",
     "gap_1": "largest relative gap of proof 1, inputs and what nodes say",
     "gap_2": "largest relative gap of proof 2, one step of the model",
@@ -176,10 +178,10 @@ def _steps(log: Log, audit: Audit, verdict: Verdict) -> Iterator[dict[str, Any]]
     with np.errstate(divide="ignore", invalid="ignore"):
         values = {
             "error": errors,
-            "gamma_path": bound / np.sqrt(energy),
+            "gamma_path": (bound - audit.path_start) / np.sqrt(energy),
             "path_bound": bound,
             "margin": 1.0 - errors / bound,
-            "mean_bound": gamma * np.sqrt(energy),
+            "mean_bound": gamma * np.sqrt(energy) + (np.nan if verdict.gamma.start is None else verdict.gamma.start),
             "energy": energy,
             **{f"gap_{number}": gaps for number, gaps in audit.gaps.items()},
             "tolerance": np.full(log.steps, audit.tolerance),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from agent.contract.errors import InputError
 from agent.contract.extras import needing
 from agent.contract.gains import Gains
+from designer.gain.start import left_by_start
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class Gamma:
     value: float
     is_claimed: bool
     failure: str | None  # why it is not proved
-    has_start: bool = False  # the problem has an initial error
+    start: float | None = 0.0  # sqrt E|z~|^2 that the initial error alone leaves at most, computed; None: not found
     is_checked: bool = True  # what is needed for that is installed
 
     def text(self) -> str:
@@ -26,7 +27,7 @@ class Gamma:
             return f"certificate  NOT CHECKED: {self.failure}; whether gamma is proved for these gains is not known"
         if self.failure is not None:
             return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
-        start = "beside what the initial error leaves" if self.has_start else "from zero initial error"
+        start = "from zero initial error" if self.start == 0.0 else "beside what the initial error leaves"
         return (
             "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes, losses "
             f"and deliveries, {start}; one run may exceed it"
@@ -35,7 +36,7 @@ class Gamma:
 
 def checked_gamma(gains: Gains) -> Gamma:
     """What the gains claim, proved again from their own numbers."""
-    claim, has_start = gains.certificate, gains.problem.plant.initial_error is not None
+    claim, problem = gains.certificate, gains.problem
     if not claim.holds:
         return Gamma(claim.gamma, is_claimed=False, failure="gamma is not claimed")
     from designer.proof.certificate import verify  # it loads ball arithmetic, which nothing else of a replay needs
@@ -47,4 +48,5 @@ def checked_gamma(gains: Gains) -> Gamma:
         if isinstance(error.__cause__, ModuleNotFoundError):
             return Gamma(claim.gamma, is_claimed=True, failure=str(error), is_checked=False)
         failure = str(error)
-    return Gamma(claim.gamma, is_claimed=True, failure=failure, has_start=has_start)
+    start = 0.0 if problem.plant.initial_error is None else left_by_start(problem, gains.K, gains.H)
+    return Gamma(claim.gamma, is_claimed=True, failure=failure, start=start)

@@ -13,7 +13,8 @@ class Trace:
 
     def __init__(self, steps: int) -> None:
         self.gaps = {proof: np.full(steps, np.nan) for proof in (1, 2, 3)}  # the largest of each proof, (steps,)
-        self.path_bound: Array = np.full(steps, np.nan)  # gamma_path(k) sqrt(sum over j < k of |w(j)|^2), (steps,)
+        self.path_bound: Array = np.full(steps, np.nan)  # gamma_path(k) sqrt(energy_before), and path_start, (steps,)
+        self.path_start: Array = np.full(steps, np.nan)  # |z~(k)| that x(0) alone leaves in this run, (steps,)
         self.energy_before: Array = np.full(steps, np.nan)  # sum over j < k of |w(j)|^2, (steps,)
 
     def add(self, check: Check) -> None:

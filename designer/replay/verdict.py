@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from agent.contract.arrays import ulps
 from agent.contract.errors import EXIT_BROKEN, EXIT_GOOD, EXIT_NO, counted
 from agent.contract.recording.evidence.examiner import Findings
+from designer.chance import Chance
 from designer.ledger.account import Account
 from designer.replay.census import Faults, Place
 from designer.replay.gamma import Gamma
@@ -156,6 +157,7 @@ class Verdict:
     energy: float | None  # sum of |w|^2
     gamma: Gamma
     pacing: Pacing | None  # of a paced run
+    chance: Chance | None  # what single runs keep; None where gamma is not proved, or says less of this run
     ledger: Account | None  # what gamma says of this run; None where it is not proved
     path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound of proof 5 that is not trivial
     leeway: float | None  # the tolerance in units of the estimates, at the last step
@@ -243,6 +245,8 @@ class Verdict:
             "gamma": self.gamma.value,
             "certificate": self.gamma.failure is None,
             "certificate_failure": self.gamma.failure,
+            "start": self.gamma.start,
+            "one_run": self.chance.document() if self.chance else None,
             "ledger": self.ledger.document() if self.ledger else None,
             "path_margin": self.path_margin,
             "proofs": [vars(proof) for proof in self.proofs],
@@ -360,10 +364,16 @@ class Verdict:
             bound = "" if self.energy is None or not self.gamma.is_claimed else self._bound(self.energy)
             against = " against the simulated plant" if self.external else ""
             lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}")
-        return [*lines, self.gamma.text(), *([f"ledger       {self.ledger.text()}"] if self.ledger else [])]
+        lines += [self.gamma.text(), *([self.chance.text()] if self.chance else [])]
+        return [*lines, *([f"ledger       {self.ledger.text()}"] if self.ledger else [])]
 
     def _bound(self, energy: float) -> str:
-        return f", gamma sqrt(energy) {self.gamma.value * energy**0.5:.4g} with gamma {self.gamma.value:.5g}"
+        gamma, start = self.gamma.value, self.gamma.start
+        if start is None:
+            return ""
+        words = "gamma sqrt(energy) + start" if start else "gamma sqrt(energy)"
+        of_start = f" and start {start:.4g}" if start else ""
+        return f", {words} {gamma * energy**0.5 + start:.4g} with gamma {gamma:.5g}{of_start}"
 
 
 def _approximately(ulps: int) -> str:

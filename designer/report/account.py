@@ -6,38 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.errors import RunBroken
-from agent.contract.problem.disturbance import White
 from designer.beyond_gamma import BeyondGamma, beyond_gamma
-from designer.gain.start import left_by_start
 from designer.ladder import ladder_of
 from designer.replay import Report, judge
 from designer.replay.log import Log, load
 from designer.replay.trace import Trace
 from designer.replay.verdict import Verdict
-from designer.single_run import single_run
-from designer.start import value_of
 
 SETTLED = 0.01  # of the largest value: what stays below it to the end need not be seen
 MOST_OF_A_RUN = 0.8  # a part of it is worth a picture of its own only where it is shorter than that
-CONFIDENCE = 0.95  # of the bound that single runs keep
 THIS_RUN = "this run: largest error / root of the energy"
-
-
-class Chance(NamedTuple):
-    """What single runs keep with a probability: P(sup_k |z_tilde(k)| >= c) <= gamma^2 (E sum |w|^2 + V) / c^2."""
-
-    gamma: float  # of a P with (17) and (18) of Theorem 1
-    energy: float  # E sum |w|^2 before the last step, and V = eta(0)'P eta(0)
-
-    def level(self, confidence: float = CONFIDENCE) -> float:
-        """The c below which |z_tilde| stays at every step of a run with this probability at least."""
-        return float(self.gamma * np.sqrt(self.energy / (1.0 - confidence)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,25 +92,10 @@ class Account:
         """
         if self.verdict.gamma.failure is not None or not self.is_as_promised or not self.log.has_plant:
             return None
-        start = left_by_start(self.log.gains.problem, self.log.gains.K, self.log.gains.H)
+        start = self.verdict.gamma.start
         if start is None:
             return None
         return np.asarray(self.verdict.gamma.value * np.sqrt(self.trace.energy_before) + start)
-
-    @cached_property
-    def chance(self) -> Chance | None:
-        """None where the gains have no proved P, or errors are not known."""
-        if self.mean_bound is None:
-            return None
-        known = single_run(self.log.gains)
-        if known is None:
-            return None
-        disturbance, before = self.log.gains.problem.disturbance, self.log.steps - 1
-        energy = float(self.trace.energy_before[-1])
-        if isinstance(disturbance, White):
-            energy = before * self.log.gains.problem.nw * disturbance.deviation**2
-        gamma, P = known
-        return Chance(gamma, energy + value_of(self.log.gains.problem, P))
 
     @cached_property
     def lost(self) -> Array:

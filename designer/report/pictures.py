@@ -6,8 +6,9 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from designer.chance import CONFIDENCE
 from designer.replay.topics import Numbers
-from designer.report.account import CONFIDENCE, Account, over_nodes
+from designer.report.account import Account, over_nodes
 from designer.report.chart import Band, Chart, Level, Line, Map, Mark, Raster
 from designer.report.scales import brief
 
@@ -116,9 +117,9 @@ def _bounds(account: Account) -> Chart:
     if account.mean_bound is not None:
         marks.append(Line("bound in the mean, γ", account.mean_bound, "mean"))
         about.append("γ bounds it in the mean over many runs: one run may be above it.")
-    if account.chance is not None:
+    if account.verdict.chance is not None:
         name = f"at least {CONFIDENCE:.0%} of such runs stay below at every step"
-        marks.append(Level(name, account.chance.level(), "chance"))
+        marks.append(Level(name, account.verdict.chance.level(), "chance"))
     marks.append(Line("|z̃|, all nodes together", norms, "plant", "dotted steps"))
     highest = max(np.nanmax(mark.values, initial=0.0) for mark in marks if isinstance(mark, Line))
     return Chart(

@@ -15,7 +15,7 @@ from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.gain.exact import Gain, Operator, exact_gain, lyapunov
-from designer.gain.floor import floor
+from designer.gain.floor import floor, floor_below
 from designer.lmi import beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
@@ -200,7 +200,7 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | 
         kind="exact",
         form="summed",
         exact=(lower_end(problem, K, H, gain), verdict.gamma),
-        floor=floor(problem),
+        floor=floor_below(problem, verdict.gamma),
         holds=verdict.holds,
         verified=f"(17) for a P summed from the gains, and the recursion of the exact gain: {verdict.arithmetic}",
         margins=verdict.margins,

@@ -93,6 +93,27 @@ def test_a_transient_is_not_growth() -> None:
     assert Prover(problem, K, H).stable.holds is True
 
 
+@pytest.mark.parametrize("own", [0.0, 0.9])
+def test_nor_is_a_long_one(own: float) -> None:
+    """In a line of 64 nodes rounding alone makes eigenvalues above 1 of the whole, and so do 300 steps if own = 0.9."""
+    problem, K, H = chain([0.5] + 63 * [own - 1.2])
+    for i, name in enumerate(problem.node_names[1:], 1):
+        K["t"][name] = {problem.node_names[i - 1]: np.array([[1.2]]), name: np.array([[own]])}
+    problem = Problem.from_document(problem.document() | {"unbiased": False})
+    model = error_model(problem, *stacked_links(problem, K, H))
+    operator = Operator(model)
+    radius = decay(operator.corner, 1, operator.units, model.moves).radius
+    assert radius == pytest.approx(max(0.25, own**2), rel=1e-6)
+
+
+def test_a_rate_that_is_proved_wrong_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for radius, says in ((0.9, 1.1), (1.1, 0.9)):
+        monkeypatch.setattr(module, "spectral_radius", lambda *given, says=says: says)
+        analysis = analyse(scalar(radius)[0], GivenGains(*scalar(radius)[1:], "by hand", None))
+        assert "how fast in the long run, floats do not tell" in analysis.text()
+        assert analysis.document()["radius"] is None
+
+
 def operator_of(case: Case) -> Operator:
     problem, K, H = case
     return Operator(error_model(problem, *stacked_links(problem, K, H)))

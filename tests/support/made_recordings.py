@@ -180,7 +180,7 @@ def simulate(
     chain, losses = schedule.modes(problem, seed=seed), schedule.Losses(problem, seed=seed)
     deliveries = schedule.Deliveries(problem, seed=seed)
     source, sent = schedule.DisturbanceSource(problem, seed=seed, worst_case=gains.worst_case), _Numbered()
-    x, mode = np.zeros(problem.nx), ""
+    x, mode = problem.initial_error.copy(), ""
     x_hat = {name: np.zeros(problem.nx) for name in problem.node_names}
     heard: dict[str, list[str]] = {name: [] for name in problem.node_names}
     sent.add("event", keys.COORDINATOR, step=0, kind="start", who="coordinator", detail="")

@@ -114,7 +114,7 @@ def test_a_lie_before_the_numbers_are_too_large_is_found(tmp_path: Path) -> None
 
 
 def audited(error: float, bound: float, rounding: float) -> PathAudit:
-    audit = PathAudit(2, Part())
+    audit = PathAudit(growing(1.2).problem, Part())
     audit.add(PathBlock(5, np.array([error]), np.array([bound]), np.array([rounding])), 1.0)
     return audit
 
@@ -127,3 +127,16 @@ def test_the_margin_is_of_the_bound_alone() -> None:
     assert silent.holds
     assert silent.compared == 0
     assert silent.note() == "it says nothing from step 5 on, where rounding may be more than the bound"
+
+
+def test_what_an_initial_error_leaves_stands_beside_the_bound(tmp_path: Path) -> None:
+    """At step 0 it is all there is, so that is in no margin; step 1 is none of those that say nothing."""
+    gains = cancelling(0.5)
+    begun = gains.problem.with_(plant={"initial_error": [1.0, -1.0]})
+    verdict = replayed(tmp_path, uncertified(begun, gains.K, gains.H, method="none"), 20)
+    assert verdict.agrees, verdict.text()
+    note = next(proof.note for proof in verdict.proofs if proof.number == 5)
+    assert note.endswith("; the bound has what x(0) leaves beside it")
+    assert "at step 0" not in note
+    assert verdict.path_margin is not None
+    assert verdict.path_margin > -1e-12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ from reports import account_of, recorded
 from agent.contract import schedule
 from agent.contract.errors import RunBroken
 from agent.contract.gains import Gains
+from designer.chance import Chance
 from designer.problems import find
 from designer.proof.certificate import prover_of
 from designer.proof.prover import Prover
-from designer.report.account import Account, Chance, over_nodes
+from designer.report.account import Account, over_nodes
 from designer.single_run import least_of_P, single_run
 from designer.synthesis import design
 
@@ -75,7 +77,7 @@ def test_of_real_sensors_only_what_they_say_is_known(tmp_path: Path) -> None:
     assert np.isfinite(account.lost[:, [0, 2, 3]]).all()
     z_hat = account.log.z_hat
     np.testing.assert_array_equal(account.errors[:, :, 0], z_hat - np.median(z_hat, axis=1)[:, None])
-    assert account.mean_bound is account.chance is None
+    assert account.mean_bound is account.verdict.chance is None
 
 
 def test_a_run_settles_where_everything_stays_small() -> None:
@@ -106,10 +108,13 @@ def test_nodes_of_which_nothing_is_known_count_for_nothing() -> None:
 def test_a_lyapunov_certificate_proves_its_gamma_for_single_runs() -> None:
     account = Account.of(GOLDEN_RUN)
     gamma = account.log.gains.certificate.gamma
-    energy = (account.log.w[:-1] ** 2).sum()
-    assert account.chance is not None
-    assert account.chance == Chance(gamma, pytest.approx(energy, rel=1e-12))
-    assert account.chance.level(0.96) == pytest.approx(5.0 * gamma * np.sqrt(energy), rel=1e-12)
+    energy, chance = (account.log.w**2).sum(), account.verdict.chance
+    assert chance is not None
+    assert chance == Chance(gamma, pytest.approx(energy, rel=1e-12))
+    assert chance.level(0.96) == pytest.approx(5.0 * gamma * np.sqrt(energy), rel=1e-12)
+    said = re.search(r"\|z~\| stays below (\S+) at every step with probability 95% at least", account.verdict.text())
+    assert said is not None
+    assert chance.level() <= float(said[1]) == pytest.approx(chance.level(), rel=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -146,4 +151,4 @@ def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: 
     assert P is not None
     turned = exact.certificate.model_copy(update={"form": "full", "P": {"linked": -P[0]}})
     assert single_run(exact.model_copy(update={"certificate": turned})) is None
-    assert account_of(tmp_path).chance is None
+    assert account_of(tmp_path).verdict.chance is None

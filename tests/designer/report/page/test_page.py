@@ -223,7 +223,7 @@ def test_gamma_is_not_promised_of_a_run_with_faults(tmp_path: Path, golden: Acco
     account = Account.of(record(tmp_path / "run.mcap", gains, faulty, steps=40, period="0.1"))
     assert account.verdict.agrees
     assert golden.mean_bound is not None
-    assert (account.mean_bound, account.chance) == (None, None)
+    assert (account.mean_bound, account.verdict.chance) == (None, None)
     assert "that is proved" not in error_sentence(account)
     assert account.verdict.ledger is not None
     assert f"of this one it says: {account.verdict.ledger.text()}" in error_sentence(account)
