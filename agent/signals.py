@@ -60,7 +60,7 @@ def interrupted_through(hand_over: Callable[[Callable[[], NoReturn]], None]) -> 
     asked: list[int] = []
 
     def interrupt() -> NoReturn:
-        raise Interrupted(asked[0])
+        raise Interrupted(asked.pop(0))
 
     def stop(number: int, frame: FrameType | None) -> None:
         asked.append(number)

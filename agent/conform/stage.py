@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
@@ -32,6 +32,7 @@ from agent.network.configuration import Network
 from agent.network.outbox import Outbox
 from agent.network.session import Session
 from agent.network.words import Replayed, Sample
+from agent.signals import interrupted_through
 
 
 class Came(NamedTuple):
@@ -63,33 +64,36 @@ Heard = Came | Gone | Garbled | Ended | Sample | Joining | Ready | Leaving | Rep
 
 
 class Stage(Closing):
-    """Use it with `with`. `hand_over` and `have` may be called by any thread, the rest by one."""
+    """Use it with `with`. `hand_over` may be called by any thread, the rest by one.
+
+    A signal meanwhile raises Interrupted where `next` is called, or at the end.
+    """
 
     def __init__(self, run: str, node: str) -> None:
         self._who, self._words, self._outboxes = node_who(node), 0, dict[str, Outbox]()
         self._queue: SimpleQueue[Callable[[], Any]] = SimpleQueue()
-        self._session = Session(Network(), run=run, who=COORDINATOR, hand_over=self._queue.put)
-        self.identity = self._session.identity
-        self.address = self._session.locators()[0]
-        self._session.watch(self._see)
         self._models: dict[str, type[Word]] = {
             joining(self._who): Joining,
             ready(self._who): Ready,
             leaving(self._who): Leaving,
         }
-        self._session.collect([estimate(node), EVENT, ACCOUNT, *self._models])
+        with ExitStack() as stack:
+            stack.enter_context(interrupted_through(self._queue.put))
+            session = Session(Network(), run=run, who=COORDINATOR, hand_over=self._queue.put)
+            self._session = stack.enter_context(closing(session))
+            self.identity = self._session.identity
+            self.address = self._session.locators()[0]
+            self._session.watch(self._see)
+            self._session.collect([estimate(node), EVENT, ACCOUNT, *self._models])
+            self._opened = stack.pop_all()
 
     def close(self) -> None:
-        """Leave, all at once: links and tokens are gone."""
-        self._session.close()
+        """Leave, all at once: links and tokens are gone. Raises Interrupted where a signal came late."""
+        self._opened.close()
 
     def hand_over(self, heard: Heard) -> None:
         """Have `next` return it."""
-        self.have(lambda: heard)
-
-    def have(self, duty: Callable[[], Any]) -> None:
-        """Have `next` do it, and return what it returns."""
-        self._queue.put(duty)
+        self._queue.put(lambda: heard)
 
     def next(self, seconds: float) -> Heard | None:
         """What is heard next; None where it is nothing for so long."""

@@ -7,20 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from agent.conform.judge import Difference, Judge
 from agent.conform.play import Play
 from agent.conform.program import Running
 from agent.conform.stage import Came, Ended, Garbled, Gone, Heard, Stage
+from agent.contract.closing import Closing
 from agent.contract.keys import COORDINATOR, MODE, PLANT, RECORDER, estimate, measurement, node_who, participants
 from agent.contract.messages import Acknowledged, Control, Joining, Leaving, Message, Ready
 from agent.guard import Guard, Unfit
 from agent.guests import programs
 from agent.network.acquaintance import refuse_version
 from agent.network.words import Replayed, Sample
-from agent.signals import interrupted_through
 
 RUN = "conform"
 KEPT = 3  # messages that the recorder acts as if it lacked them at the end
@@ -40,7 +39,7 @@ class Setting:
     tolerance: float = 0.0
 
 
-class Trial:
+class Trial(Closing):
     """A run; use it with `with`. Whatever the program does wrong is raised as a Difference."""
 
     def __init__(self, setting: Setting, *, period: float = 0.0, first: int = 0, also: bytes = b"") -> None:
@@ -70,18 +69,11 @@ class Trial:
         except BaseException:
             self.stage.close()
             raise
-        self._interruptible = interrupted_through(self.stage.have)
-        self._interruptible.__enter__()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.program.close()
-        self.stage.close()
-        self._interruptible.__exit__(kind, error, trace)
+    def close(self) -> None:
+        """End the program, and leave."""
+        with self.stage:
+            self.program.close()
 
     # What is heard.
     def until(self, condition: Callable[[], object], what: str, *, seconds: float | None = None) -> None:

@@ -120,10 +120,8 @@ def viewing(network: Network, run: str, words: Words) -> Iterator[Session]:
 
     before = heed(stop)
     try:
-        with (
-            closing(Session(network, run=run, who=VIEWER, hand_over=words.put)) as session,
-            interrupted_through(words.put),
-        ):
+        session = Session(network, run=run, who=VIEWER, hand_over=words.put)
+        with interrupted_through(words.put), closing(session):
             yield session
     finally:
         restore(before)

@@ -82,7 +82,7 @@ class Stranger:
 
     def ask(self, topic: str) -> list[Any]:
         """The answers to a question."""
-        return [reply.ok for reply in self.session.get(self._base + topic, timeout=2.0) if reply.ok is not None]
+        return [reply.ok for reply in self.session.get(self._base + topic, timeout=PATIENCE) if reply.ok is not None]
 
     def answer(self, topic: str, *replies: tuple[str, bytes, bytes | None]) -> None:
         """Answer whatever is asked there; a reply has its whole key."""

@@ -18,7 +18,7 @@ from agent.network.configuration import Network
 from agent.network.outbox import Sent
 from agent.network.session import Session
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 LISTENER = """
 import sys
 from agent.network.configuration import Network

@@ -26,7 +26,7 @@ from designer.replay import replay
 
 GAINS = GOLDEN / "zhu2020-lossy.gains.json"
 NAMES = Gains.load(GAINS).problem.node_names
-PATIENCE = 30.0  # seconds that a client waits for a message
+PATIENCE = 60.0  # seconds that a client waits for a message
 STEPS = 50
 
 
@@ -84,8 +84,8 @@ def test_a_client_gets_every_message_of_a_run(roles: Callable[[int], Roles]) -> 
         run.start()
         messages = client.messages()
         received = {(topic, json.loads(said)["step"]): said for topic, said in messages if topic != "event"}
-        assert run.coordinator.wait(60) == 0
-        assert process.wait(30) == 0
+        assert run.coordinator.wait(PATIENCE) == 0
+        assert process.wait(PATIENCE) == 0
     assert received == numbers_of(run.recording)
     assert len(received) == STEPS * (2 + 2 * len(NAMES))
     assert all("z" in json.loads(received["plant/state", k]) for k in range(STEPS))
@@ -106,8 +106,8 @@ def test_it_comes_late_and_is_killed_and_the_run_does_not_notice(roles: Callable
                 break
         process.kill()
     run.coordinator.send_signal(signal.SIGINT)
-    assert run.coordinator.wait(60) == 130
-    run.recorder.wait(60)
+    assert run.coordinator.wait(PATIENCE) == 130
+    run.recorder.wait(PATIENCE)
     end = end_of(run.recording)
     assert end is not None
     assert end["status"] == "stopped"
@@ -119,7 +119,7 @@ def test_it_is_stopped_by_a_signal(roles: Callable[[int], Roles]) -> None:
     run = roles(STEPS)
     with viewer(run.address) as (process, _):
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+        assert process.wait(PATIENCE) == 130
     assert run.coordinator.poll() is None
 
 

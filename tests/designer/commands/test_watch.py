@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,13 +22,14 @@ from roles import Roles
 from runs import MANY, PATIENCE, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
 
 from agent.authority import Authority
-from agent.contract.errors import Interrupted
+from agent.contract.errors import Interrupted, RunBroken
 from agent.contract.gains import Gains
 from agent.contract.messages import Estimate, PlantState
 from agent.contract.rights import everybody
 from agent.network.arrivals import Arrival
-from agent.network.words import Sample
+from agent.network.words import Sample, Words
 from agent.plan import Pace
+from agent.signals import interrupted_through
 from designer.commands.watch import _take_in, add_watch
 from designer.replay import replay
 from designer.watch.scene import Scene
@@ -209,13 +211,23 @@ def test_what_is_no_message_is_counted_and_stops_nothing(topic: str) -> None:
     assert scene.seen().unreadable == 1
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_a_signal_that_comes_while_a_message_is_read_is_heeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not taken for what is wrong with the message, and the message is read to its end."""
+    words, scene = Words(""), Scene("a-run")
+
+    class Looking(Silent):
+        def heed(self) -> None:
+            words.take(time.monotonic())
+
     def signalled(topic: str, payload: bytes) -> NoReturn:
-        raise Interrupted(signal.SIGHUP)
+        signal.raise_signal(signal.SIGINT)
+        raise RunBroken("it is no message")
 
     monkeypatch.setattr("agent.contract.keys.decode", signalled)
-    with pytest.raises(Interrupted):
-        _take_in(Silent("mode", b"{}"), Scene("a-run"), 0.0, "")  # type: ignore[arg-type]
+    with interrupted_through(words.put), pytest.raises(Interrupted):
+        _take_in(Looking("mode", b"{}"), scene, 0.0, "")  # type: ignore[arg-type]
+    assert scene.seen().unreadable == 1
 
 
 def test_its_options_may_stand_in_the_environment() -> None:
