@@ -15,15 +15,14 @@ import zenoh
 RUN, NODE, ADDRESS, GAINS = (os.environ[f"PEAKMESH_{name}"] for name in ("RUN", "NODE", "CONNECT", "GAINS"))
 WHO, BASE, IDENTITY = f"node-{NODE}", f"peakmesh/{RUN}/", f"{time.time_ns():020d}-plain"
 ESTIMATE, MEASUREMENT, BLOCK = f"node/{NODE}/estimate", f"node/{NODE}/measurement", zenoh.CongestionControl.BLOCK
-where = f'mode: "client", connect: {{endpoints: ["{ADDRESS}"]}}, transport: {{link: {{tx: {{lease: 20000}}}}}}'
-session = zenoh.open(zenoh.Config.from_json5(f"{{{where}}}"))
+config = {"mode": "client", "connect": {"endpoints": [ADDRESS]}, "transport": {"link": {"tx": {"lease": 20000}}}}
+session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 gains, digest = json.loads(Path(GAINS).read_bytes()), hashlib.sha256(Path(GAINS).read_bytes()).hexdigest()
 K, H, problem = gains["K"], gains["H"], gains["problem"]
 links, unbiased, A, M = problem.get("link", []), problem.get("unbiased"), problem["plant"]["A"], problem["plant"]["M"]
 nodes = {node["name"]: node for node in problem["node"]}
 C, is_seen, i = nodes[NODE]["C"], nodes[NODE].get("loss") == "seen", list(nodes).index(NODE)
-weights = {mode["name"]: dict(zip(nodes, mode["adjacency"][i], strict=True)) for mode in problem["topology"]}
-hears = {mode: [j for j in nodes if a[j] > 0] for mode, a in weights.items()}
+hears = {m["name"]: {j: a for j, a in zip(nodes, m["adjacency"][i], strict=True) if a > 0} for m in problem["topology"]}
 inbox, there, present, kept, words, numbers = queue.SimpleQueue(), {}, set(), [], count(), count()
 said = {"control": {"order": ""}, "acknowledged": {"received": {}, "closed": False}}  # the last words of those two
 linked = {"coordinator", "recorder", *(f"node-{j}" for j in nodes)}
@@ -40,25 +39,26 @@ def innovation(y, x):  # equation (4); [] is y where nothing arrived
 
 def step(mode, x, nu, heard):  # equation (5); for a pair that was not heard stands what the node knows itself
     rows, told = (A, x) if unbiased else ([[]] * len(x), [])
-    for j in hears[mode]:
+    for j, a in hears[mode].items():
         x_j, nu_j = (x, nu) if j == NODE else heard.get(j, (x, [0.0] * len(nodes[j]["C"])))
         both = zip(rows, K[mode][NODE][j], H[mode][NODE][j], strict=True)
-        rows = [[*row, *(weights[mode][j] * g for g in (*K_r, *H_r))] for row, K_r, H_r in both]
+        rows = [[*row, *(a * g for g in (*K_r, *H_r))] for row, K_r, H_r in both]
         told = [*told, *(v - w if unbiased else v for v, w in zip(x_j, x, strict=True)), *nu_j]
     return times(rows, told)
 
 
-def lost(k, seed):  # whose message of step k the model loses: Philox 4x64-10, key (seed, 4), four numbers a count
-    drawn, counts, bits = [], -(-len(links) // 4), 2**64 - 1
-    for first in range(k * counts + 1, (k + 1) * counts + 1):
-        c, low, high = (first, 0, 0, 0), seed, 4
-        for _ in range(10):
-            p, q = 0xD2E7470EE14C6C93 * c[0], 0xCA5A826395121157 * c[2]
-            c = q >> 64 ^ c[1] ^ low, q & bits, p >> 64 ^ c[3] ^ high, p & bits
-            low, high = low + 0x9E3779B97F4A7C15 & bits, high + 0xBB67AE8584CAA73B & bits
-        drawn += [(word >> 11) * 2.0**-53 for word in c]
-    mine = [(link, u) for link, u in zip(links, drawn, strict=False) if link["receiver"] == NODE]
-    return {link["sender"] for link, u in mine if u >= link["delivery_probability"]}
+def drawn(k, m, seed):  # for link m at step k: a word of Philox 4x64-10 with key (seed, 4), four of them a count
+    c, low, high, bits = (k * -(-len(links) // 4) + m // 4 + 1, 0, 0, 0), seed, 4, 2**64 - 1
+    for _ in range(10):
+        p, q = 0xD2E7470EE14C6C93 * c[0], 0xCA5A826395121157 * c[2]
+        c = q >> 64 ^ c[1] ^ low, q & bits, p >> 64 ^ c[3] ^ high, p & bits
+        low, high = low + 0x9E3779B97F4A7C15 & bits, high + 0xBB67AE8584CAA73B & bits
+    return (c[m % 4] >> 11) * 2.0**-53
+
+
+def lost(k, seed):  # whose message of step k the model loses
+    mine = [(m, link) for m, link in enumerate(links) if link["receiver"] == NODE]
+    return {link["sender"] for m, link in mine if drawn(k, m, seed) >= link["delivery_probability"]}
 
 
 def say(topic, **word):  # what runs the run
@@ -97,8 +97,7 @@ def heed(topic, payload, at):
         said[kind] = word
         kept[:] = [sent for sent in kept if sent[0] >= said["acknowledged"]["received"].get(WHO, 0)]
         if kind == "control" and word["order"] in ("close", "stop"):
-            while "recorder" in present and not said["acknowledged"]["closed"]:
-                heed(*inbox.get())
+            wait(lambda: said["acknowledged"]["closed"] or "recorder" not in present)
             raise SystemExit(word["reason"] or not said["acknowledged"]["closed"] or bool(kept))
     elif WHO in word["cast"]:
         raise SystemExit("another process has this name in the run")

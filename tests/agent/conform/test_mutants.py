@@ -65,7 +65,7 @@ ARITHMETIC = {  # (network, from, to, what must be said)
         "[g * v for g, v in zip(row, vector, strict=True)][::-1])",
         "sums in another order",
     ),
-    "ignores weights": ("sizes", "(weights[mode][j] * g for", "(g for", "x_hat["),
+    "ignores weights": ("sizes", "(a * g for", "(g for", "x_hat["),
     "ignores that losses are hidden": (
         "lossy",
         'else nodes[NODE]["arrival_probability"]',
@@ -76,16 +76,16 @@ ARITHMETIC = {  # (network, from, to, what must be said)
     "is not unbiased": ("unbiased", 'problem.get("unbiased")', "False", "sums in another order"),
     "hears those who hear it": (
         "lossy",
-        'mode["adjacency"][i], strict',
-        '[a[i] for a in mode["adjacency"]], strict',
+        'm["adjacency"][i], strict',
+        '[a[i] for a in m["adjacency"]], strict',
         "heard is [",
     ),
     "uses what the model loses": ("links", 'if link["receiver"] == NODE]', 'if link["receiver"] == ""]', "heard is ["),
-    "draws with another seed": ("links", "(first, 0, 0, 0), seed, 4", "(first, 0, 0, 0), seed + 1, 4", "heard is ["),
+    "draws with another seed": ("links", "1, 0, 0, 0), seed, 4", "1, 0, 0, 0), seed + 1, 4", "heard is ["),
     "says that it used what was lost": (
         "links",
         "heard = [j for j in hears[mode] if j not in gone]\n",
-        "heard = hears[mode]\n",
+        "heard = list(hears[mode])\n",
         "heard is [",
     ),
     "uses old estimates": (
