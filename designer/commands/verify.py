@@ -85,7 +85,8 @@ def verify_command(options: argparse.Namespace) -> int:
     else:
         no = f"gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
         if verdict.low_is_false:
-            no = f"{options.gains} says what is proved false: {verdict.failure}; gamma = {verdict.gamma} itself is proved"
+            false = f"{options.gains} says what is proved false: {verdict.failure}"
+            no = f"{false}; gamma = {verdict.gamma} itself is proved"
         lines = [f"does not hold: {no}", *lines]
     print("\n".join([*lines, f"in      {how}"]))
     return good

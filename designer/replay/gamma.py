@@ -26,9 +26,10 @@ class Gamma:
             return "certificate  none: gamma is not claimed"
         if not self.is_checked:
             return f"certificate  NOT CHECKED: {self.failure}; whether gamma is proved for these gains is not known"
+        if self.failure is not None and self.is_proved:
+            return f"certificate  FAILS: {self.failure}; gamma itself is proved"
         if self.failure is not None:
-            itself = "gamma itself is proved" if self.is_proved else "gamma is not proved for these gains"
-            return f"certificate  FAILS: {self.failure}; {itself}"
+            return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
         start = "from zero initial error" if self.start == 0.0 else "beside what the initial error leaves"
         return (
             "certificate  holds: gamma bounds sup_k E|z~(k)|^2 <= gamma^2 sum |w|^2, in the mean over modes, losses "
@@ -51,10 +52,5 @@ def checked_gamma(gains: Gains) -> Gamma:
             return Gamma(claim.gamma, is_claimed=True, failure=str(error), is_checked=False)
         return Gamma(claim.gamma, is_claimed=True, failure=str(error))
     start = 0.0 if problem.plant.initial_error is None else left_by_start(problem, gains.K, gains.H)
-    return Gamma(
-        claim.gamma,
-        is_claimed=True,
-        failure=verdict.failure,
-        is_proved=verdict.low_is_false or verdict.holds,
-        start=start,
-    )
+    is_proved = verdict.holds or verdict.low_is_false
+    return Gamma(claim.gamma, is_claimed=True, failure=verdict.failure, is_proved=is_proved, start=start)
