@@ -18,7 +18,8 @@ SAYS = re.compile(r"\b(proved|certified|certificate|computed|REFUTED|floats tell
 
 def literals(module: str) -> list[str]:
     """What a module may print: its strings, a formatted one as one with its values left out; no docstrings."""
-    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text())
+    file = ROOT / f"{module.replace('.', '/')}.py"
+    tree = ast.parse((file if file.exists() else file.with_suffix("") / "__init__.py").read_text())
     inner = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
     silent = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     found = []

@@ -89,8 +89,9 @@ def first_fault(error: ValidationError, document: Any, known: Callable[[Location
             return f'{place}"{fault["loc"][-1]}" is missing'
         case "extra_forbidden":
             absent = [str(f["loc"][-1]) for f in faults if f["type"] == "missing"]
-            near = get_close_matches(str(fault["loc"][-1]), known(fault["loc"][:-1]) if known else (), n=1)
-            hint = f'; did you mean "{near[0]}"?' if near else ""
+            key = str(fault["loc"][-1])
+            near = get_close_matches(key, known(fault["loc"][:-1]) if known else (), n=1)
+            hint = f'; did you mean "{near[0]}"?' if near and near[0] != key else ""  # another kind has that key
             hint = f"; {listed(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else hint
             return f"{place}this key is not known here{hint}"
         case "value_error":

@@ -83,8 +83,11 @@ def verify_command(options: argparse.Namespace) -> int:
         lines += [] if in_box is None else in_box.of_verify()
         lines += [f"claimed {text}" for text in _claimed(gains, verdict.low)]
     else:
-        no = f"does not hold: gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
-        lines = [no, *lines]
+        no = f"gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
+        if verdict.low_is_false:
+            false = f"{options.gains} says what is proved false: {verdict.failure}"
+            no = f"{false}; gamma = {verdict.gamma} itself is proved"
+        lines = [f"does not hold: {no}", *lines]
     print("\n".join([*lines, f"in      {how}"]))
     return good
 

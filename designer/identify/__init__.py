@@ -81,7 +81,7 @@ class Identification(NamedTuple):
         if self.gain is None:
             return f"{before} as designed; as observed none: {self.refusal}"
         if not self.gain.stable:
-            return f"{before} as designed; as observed the errors are NOT mean-square stable"
+            return f"{before} as designed; as observed the errors do NOT die out, as far as floats tell"
         return f"{before} as designed, {_number(self.gain)} of the same gains as observed"
 
 

@@ -41,7 +41,8 @@ def _with_lower_end(claim: Certificate, prover: Prover, verdict: Verdict) -> Ver
     if low <= claim.gamma and (low <= 0.0 or prover.at_least(low) is not None):
         return verdict._replace(low=low)
     if low > claim.gamma or prover.exact(low).holds:
-        return verdict._replace(holds=False, failure=f"the exact gain is below {low}, where the file says it begins")
+        why = f"the exact gain is below {low}, where the file says it begins"
+        return verdict._replace(holds=False, failure=why, low_is_false=True)
     return verdict
 
 

@@ -17,6 +17,7 @@ class Gamma:
     value: float
     is_claimed: bool
     failure: str | None  # why it is not proved
+    is_proved: bool = False  # though something else that is claimed is false
     start: float | None = 0.0  # sqrt E|z~|^2 that the initial error alone leaves at most, computed; None: not found
     is_checked: bool = True  # what is needed for that is installed
 
@@ -25,6 +26,8 @@ class Gamma:
             return "certificate  none: gamma is not claimed"
         if not self.is_checked:
             return f"certificate  NOT CHECKED: {self.failure}; whether gamma is proved for these gains is not known"
+        if self.failure is not None and self.is_proved:
+            return f"certificate  FAILS: {self.failure}; gamma itself is proved"
         if self.failure is not None:
             return f"certificate  FAILS: {self.failure}; gamma is not proved for these gains"
         start = "from zero initial error" if self.start == 0.0 else "beside what the initial error leaves"
@@ -43,10 +46,11 @@ def checked_gamma(gains: Gains) -> Gamma:
 
     try:
         with needing("the proof of so large a network"):
-            failure = verify(gains).failure
+            verdict = verify(gains)
     except InputError as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             return Gamma(claim.gamma, is_claimed=True, failure=str(error), is_checked=False)
-        failure = str(error)
+        return Gamma(claim.gamma, is_claimed=True, failure=str(error))
     start = 0.0 if problem.plant.initial_error is None else left_by_start(problem, gains.K, gains.H)
-    return Gamma(claim.gamma, is_claimed=True, failure=failure, start=start)
+    is_proved = verdict.holds or verdict.low_is_false
+    return Gamma(claim.gamma, is_claimed=True, failure=verdict.failure, is_proved=is_proved, start=start)

@@ -71,7 +71,7 @@ def design_exact(
     if math.isinf(floor(problem)):
         raise Unattainable(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
-            "the plant that the disturbance drives; measure it"
+            "the plant that the disturbance drives, as far as floats tell; measure it"
         )
     own, lmi_gamma, stopped = starts is None, None, False
     if starts is None:
@@ -99,7 +99,8 @@ def design_exact(
     if not chosen.gain.stable:
         raise Unattainable(
             f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
-            f"{chosen.gain.radius:.6g} in each step, and less than 1 is needed; {_advice(problem)}"
+            f"{chosen.gain.radius:.6g} in each step, as far as floats tell, and less than 1 is needed; "
+            f"{_advice(problem)}"
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
@@ -185,8 +186,10 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | 
     if gain is None or Coordinates.of(problem) is not None:
         gain = exact_gain(model_of_gains(problem, K, H))
     if not gain.stable:
+        known = Prover(problem, K, H).stable.holds
+        are = "are not mean-square stable, which is proved" if known is False else "are not known to be stable"
         raise Unattainable(
-            f"the gains for {problem.name} are not mean-square stable: they multiply E|error|^2 by {gain.radius:.6g} "
+            f"the gains for {problem.name} {are}; as far as floats tell they multiply E|error|^2 by {gain.radius:.6g} "
             "in each step, and less than 1 is needed"
         )
     verdict = confirmed(problem, K, H, gain.high)

@@ -14,6 +14,7 @@ from agent.contract.gains import Gains
 from designer.cli import main
 from designer.commands import design as design_command
 from designer.problems import find, names
+from designer.replay.gamma import checked_gamma
 from designer.reproduce import EXAMPLES, Reproduced
 from designer.search import effort, windows
 from designer.search.descent import Progress, descend
@@ -86,6 +87,20 @@ def test_no_proof_depends_on_a_name(folder: Path, capsys: pytest.CaptureFixture[
     capsys.readouterr()
     assert run("verify", "gains.json", "renamed.toml") == 0
     assert 'differs from the one given in "name", on which no proof depends' in capsys.readouterr().out
+
+
+def test_a_lower_end_that_is_false_leaves_gamma_proved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is the file that is wrong, and says so; not gamma."""
+    assert run("design", "two-nodes", "-o", "gains.json") == 0
+    document = json.loads(Path("gains.json").read_text())
+    low = document["certificate"]["exact"][0] = 1.001 * document["certificate"]["gamma"]
+    Path("gains.json").write_text(json.dumps(document))
+    capsys.readouterr()
+    assert run("verify", "gains.json") == 1
+    said = capsys.readouterr().out
+    assert said.startswith(f"does not hold: gains.json says what is proved false: the exact gain is below {low}")
+    assert f"gamma = {document['certificate']['gamma']} itself is proved" in said
+    assert "gamma itself is proved" in checked_gamma(Gains.load(Path("gains.json"))).text()
 
 
 @pytest.mark.parametrize("command", [("verify",), ("show",), ("analyse", "two-nodes", "--gains")])

@@ -485,6 +485,8 @@ def test_the_interval_of_the_exact_gain_is_proved(network: str, makes: Sequence[
         f"the exact gain is below {high * (1.0 + 1e-5)}, where the file says it begins"
     )
     assert not saying(high * (1.0 + 1e-5)).holds
+    assert saying(high * (1.0 + 1e-5), 2.0 * high).low_is_false
+    assert not saying(proved, 0.9 * high).low_is_false
 
 
 def test_what_no_w_attains_is_not_proved_to_be_attained(monkeypatch: pytest.MonkeyPatch) -> None:

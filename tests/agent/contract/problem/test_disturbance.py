@@ -12,6 +12,7 @@ REFUSED = [
     (edited(SINE, 'kind = "sine"'),
      'disturbance: kind "sine" is not known; there are "damped-sine", "impulse", "white", "csv", "worst-case", "none"'),
     (edited("decay = 0.2", ""), 'disturbance: "decay" is missing'),
+    (edited(SINE, 'kind = "none"\ndecay = 1'), "disturbance: decay: this key is not known here"),
     (edited("decay = 0.2", "decay = -1"), "disturbance: decay: must be at least 0, got -1"),
     (edited("decay = 0.2", 'decay = "1"'), "disturbance: decay: must be a number, got '1'"),
     (edited("decay = 0.2", "decay = true"), "disturbance: decay: must be a number, got True"),
