@@ -16,7 +16,8 @@ import numpy as np
 from agent.contract.arrays import Array
 from designer.decay import Decay, decay, invariants, lasting, scaled
 from designer.gain.products import Collected, Pattern, Products
-from designer.model.error_model import ErrorModel, LinkTerms
+from designer.model.error_model import ErrorModel
+from designer.model.links import LinkTerms
 from designer.model.units import natural_scale
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2

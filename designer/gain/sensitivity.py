@@ -18,8 +18,9 @@ from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.gain.exact import Operator, horizon_gain, recursion_holds, step
 from designer.gain.products import Collected, Pattern
-from designer.model.error_model import ErrorModel, Indices, LinkTerms, error_model, stacks
-from designer.model.mismatch import Innovation, Real, real_error_model
+from designer.model.error_model import ErrorModel, Indices, error_model, stacks
+from designer.model.links import LinkTerms
+from designer.model.mismatch import Real, innovations, real_error_model
 
 
 class Sweep(NamedTuple):
@@ -69,8 +70,8 @@ class Inputs:
         self.p, self.rho = problem.plant_states, problem.delivery
         if real is not None:
             self.p, self.rho = nx if carry else 0, real.rho
-            mean = Innovation(problem, problem.beta, real, self.p)
-            self.by_e, self.by_w, self.by_x = mean.by_e, mean.by_w, mean.by_x[:, : self.p]
+            mean = innovations(problem, problem.beta, real, self.p)
+            self.by_e, self.by_w, self.by_x = mean.by_e, mean.by_w, mean.by_x
         self.rho_K = np.kron(self.rho, np.ones((nx, nx)))
         widths = [len(node.C) for node in problem.nodes]
         self.rho_H = np.repeat(np.repeat(self.rho, nx, axis=0), widths, axis=1)

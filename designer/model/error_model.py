@@ -22,27 +22,10 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
+from designer.model.links import Innovations, LinkTerms, link_terms
 
 Indices = NDArray[np.intp]
 StackedGains = tuple[Array, Array]  # K_bar (modes, n nx, n nx) and H_bar (modes, n nx, sum ny) of (8)
-
-
-@dataclass(frozen=True, eq=False)
-class LinkTerms:
-    """What lossy links do to the errors: xi_l V_l [eta; w] is added to e of one node, for every l, in one mode.
-
-    xi_l is phi_ij - rho_ij, or (phi_ij - rho_ij)(theta_j - beta_j) where `with_loss`. Only some columns of V_l are
-    not zero, and those are kept.
-    """
-
-    mode: Indices  # (terms,)
-    receiver: Indices  # (terms,): i
-    sender: Indices  # (terms,): j
-    with_loss: NDArray[np.bool_]  # (terms,)
-    rho: Array  # (terms,): rho_ij
-    variance: Array  # (terms,): of xi_l
-    columns: Indices  # (terms, c): of [eta; w]; those of (x, e_i, e_j, w)
-    V: Array  # (terms, nx, c)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +222,7 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
         ones = np.tile(np.eye(nx), (n, 1))  # (n nx, nx): 1 kron I
         A[:, p:, :p] = np.tile(plant.A, (n, 1)) - K_bar @ ones
     R = _taken_by_losses(problem, bar, p)
+    innovations = Innovations(bar.rows, np.zeros((len(R), p)), bar.C_beta, bar.D_beta, R)
     M = np.hstack([np.zeros((n * problem.nz, p)), bar.M])
     return ErrorModel(
         A=A,
@@ -251,7 +235,7 @@ def error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:
         transition=problem.markov.transition,
         plant_states=p,
         rows=bar.rows,
-        links=_link_terms(problem, bar, K_bar, H_bar, R, p),
+        links=link_terms(problem, innovations, K_bar, H_bar, rho=problem.delivery, alpha=bar.alpha),
     )
 
 
@@ -282,52 +266,6 @@ def _taken_by_losses(problem: Problem, bar: Stacks, p: int) -> Array:
         else:
             R[rows, :p] = node.C
     return R
-
-
-def _link_terms(problem: Problem, bar: Stacks, K_bar: Array, H_bar: Array, R: Array, p: int) -> LinkTerms | None:
-    """phi_ij - rho_ij multiplies a_ij (K_ij (e_j - e_i) - H_ij times the mean innovation of node j) in e_i.
-
-    Its product with theta_j - beta_j multiplies -a_ij H_ij times what a loss takes from the innovation.
-    """
-    nx, n, size = problem.nx, problem.n, p + problem.n * problem.nx
-    at_w = np.arange(size, size + problem.nw)
-    if not problem.links:
-        return None
-    found = [
-        (s, i, j, with_loss)
-        for s in range(len(problem.topologies))
-        for i in range(n)
-        for j in problem.neighbours(s, i)
-        if problem.delivery[i, j] < 1.0
-        for with_loss in ((False, True) if bar.alpha[j] > 0.0 else (False,))
-    ]
-    if not found:
-        return None
-    columns, V = [], []
-    for s, i, j, with_loss in found:
-        at_i, at_j = (np.arange(p + node * nx, p + (node + 1) * nx) for node in (i, j))
-        here = np.concatenate([np.arange(p), at_i, at_j, at_w])
-        K_ij = K_bar[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx]
-        H_ij = H_bar[s, i * nx : (i + 1) * nx, bar.rows[j]]
-        if with_loss:
-            term = -H_ij @ R[bar.rows[j]][:, here]
-        else:
-            C_j = bar.C_beta[bar.rows[j], j * nx : (j + 1) * nx]
-            term = np.hstack([np.zeros((nx, p)), -K_ij, K_ij - H_ij @ C_j, -H_ij @ bar.D_beta[bar.rows[j]]])
-        columns.append(here)
-        V.append(term)
-    mode, receiver, sender, lost_too = (np.array(part) for part in zip(*found, strict=True))
-    rho = problem.delivery[receiver, sender]
-    return LinkTerms(
-        mode=mode,
-        receiver=receiver,
-        sender=sender,
-        with_loss=lost_too.astype(np.bool_),
-        rho=rho,
-        variance=rho * (1.0 - rho) * np.where(lost_too, bar.alpha[sender], 1.0),
-        columns=np.array(columns),
-        V=np.array(V),
-    )
 
 
 def paper_error_model(problem: Problem, K_bar: Array, H_bar: Array) -> ErrorModel:

@@ -14,7 +14,8 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from agent.contract.problem.matrices import Matrices
-from designer.model.error_model import ErrorModel, LinkTerms, error_model, measurement_slices
+from designer.model.error_model import ErrorModel, error_model, measurement_slices
+from designer.model.links import Innovations, LinkTerms, link_terms
 
 
 class Real(NamedTuple):
@@ -68,7 +69,7 @@ def real_error_model(
     of B, of D, and of the beta_i of nodes that see their losses.
     """
     nx, n, p, rows = problem.nx, problem.n, problem.nx if carry else 0, measurement_slices(problem)
-    innovation = Innovation(problem, told, real, p)
+    innovation, alpha = innovations(problem, told, real, p), real.beta * (1.0 - real.beta)
     rho_K = np.kron(real.rho, np.ones((nx, nx)))
     H = H_bar * np.repeat(np.repeat(real.rho, nx, axis=0), [len(node.C) for node in problem.nodes], axis=1)
     size, modes = p + n * nx, len(K_bar)
@@ -94,68 +95,30 @@ def real_error_model(
         R=innovation.lost,
         M=M,
         beta=real.beta,
-        alpha=real.beta * (1.0 - real.beta),
+        alpha=alpha,
         transition=real.transition,
         plant_states=p,
         rows=rows,
-        links=_links(problem, real, innovation, K_bar, H_bar),
+        links=link_terms(problem, innovation, K_bar, H_bar, rho=real.rho, alpha=alpha),
     )
 
 
-class Innovation:
-    """Its mean over theta, by_x x + by_e e + by_w w for all nodes, and what a loss takes from it, lost [eta; w]."""
-
-    def __init__(self, problem: Problem, told: Array, real: Real, p: int) -> None:
-        nx, n, nw, self.rows, self.p = problem.nx, problem.n, problem.nw, measurement_slices(problem), p
-        ny, size = self.rows[-1].stop, p + problem.n * problem.nx
-        self.by_x, self.by_e, self.by_w = np.zeros((ny, nx)), np.zeros((ny, n * nx)), np.zeros((ny, nw))
-        self.lost = np.zeros((ny, size + nw))
-        for j, (node, rows) in enumerate(zip(problem.nodes, self.rows, strict=True)):
-            C, D, beta, c = real.matrices.C[j], real.matrices.D[j], real.beta[j], told[j]
-            e_j = slice(j * nx, (j + 1) * nx)
-            if node.seen:
-                self.by_x[rows], self.by_e[rows, e_j], self.by_w[rows] = beta * (C - node.C), beta * node.C, beta * D
-                self.lost[rows, p + j * nx : p + (j + 1) * nx], self.lost[rows, size:] = node.C, D
-                self.lost[rows, :p] = (C - node.C)[:, :p]
-            else:
-                self.by_x[rows], self.by_e[rows, e_j], self.by_w[rows] = beta * C - c * node.C, c * node.C, D
-                self.lost[rows, :p] = C[:, :p]
-        if not p and self.by_x.any():
-            raise ValueError("the errors contain x, which is left out")
-
-
-def _links(problem: Problem, real: Real, of: Innovation, K_bar: Array, H_bar: Array) -> LinkTerms | None:
-    """Where a message may be lost: its own part, and the product with the loss of what it is of."""
-    nx, n, p, size = problem.nx, problem.n, of.p, of.lost.shape[1] - problem.nw
-    alpha = real.beta * (1.0 - real.beta)
-    found = [
-        (s, i, j, with_loss)
-        for s in range(len(problem.topologies))
-        for i in range(n)
-        for j in problem.neighbours(s, i)
-        if real.rho[i, j] < 1.0
-        for with_loss in ((False, True) if alpha[j] > 0.0 else (False,))
-    ]
-    if not found:
-        return None
-    columns, V = [], []
-    for s, i, j, with_loss in found:
-        at_i, at_j = (np.arange(p + node * nx, p + (node + 1) * nx) for node in (i, j))
-        here = np.concatenate([np.arange(p), at_i, at_j, np.arange(size, size + problem.nw)])
-        K_ij = K_bar[s, i * nx : (i + 1) * nx, j * nx : (j + 1) * nx]
-        H_ij, rows = H_bar[s, i * nx : (i + 1) * nx, of.rows[j]], of.rows[j]
-        mean = [-H_ij @ of.by_x[rows][:, :p], -K_ij, K_ij - H_ij @ of.by_e[rows, j * nx : (j + 1) * nx]]
-        columns.append(here)
-        V.append(-H_ij @ of.lost[rows][:, here] if with_loss else np.hstack([*mean, -H_ij @ of.by_w[rows]]))
-    mode, receiver, sender, lost_too = (np.array(part) for part in zip(*found, strict=True))
-    rho = real.rho[receiver, sender]
-    return LinkTerms(
-        mode=mode,
-        receiver=receiver,
-        sender=sender,
-        with_loss=lost_too.astype(np.bool_),
-        rho=rho,
-        variance=rho * (1.0 - rho) * np.where(lost_too, alpha[sender], 1.0),
-        columns=np.array(columns),
-        V=np.array(V),
-    )
+def innovations(problem: Problem, told: Array, real: Real, p: int) -> Innovations:
+    """Those of filters that have the C_i of `problem`, and beta = `told`; ValueError where they need x, and p is 0."""
+    nx, n, all_rows = problem.nx, problem.n, measurement_slices(problem)
+    ny, size = all_rows[-1].stop, p + n * nx
+    by_x, by_e, by_w = np.zeros((ny, nx)), np.zeros((ny, n * nx)), np.zeros((ny, problem.nw))
+    lost = np.zeros((ny, size + problem.nw))
+    for j, (node, rows) in enumerate(zip(problem.nodes, all_rows, strict=True)):
+        C, D, beta, c = real.matrices.C[j], real.matrices.D[j], real.beta[j], told[j]
+        e_j = slice(j * nx, (j + 1) * nx)
+        if node.seen:
+            by_x[rows], by_e[rows, e_j], by_w[rows] = beta * (C - node.C), beta * node.C, beta * D
+            lost[rows, p + j * nx : p + (j + 1) * nx], lost[rows, size:] = node.C, D
+            lost[rows, :p] = (C - node.C)[:, :p]
+        else:
+            by_x[rows], by_e[rows, e_j], by_w[rows] = beta * C - c * node.C, c * node.C, D
+            lost[rows, :p] = C[:, :p]
+    if not p and by_x.any():
+        raise ValueError("the errors contain x, which is left out")
+    return Innovations(all_rows, by_x[:, :p], by_e, by_w, lost)
