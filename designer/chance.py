@@ -45,5 +45,5 @@ def chance(gains: Gains, *, steps: int, energy: float) -> Chance | None:
         return None
     if isinstance(disturbance, White):
         energy = steps * gains.problem.nw * disturbance.deviation**2
-    gamma, P = known
-    return Chance(gamma, energy + value_of(gains.problem, P))
+    gamma, P, T = known
+    return Chance(gamma, energy + value_of(gains.problem, P, T))

@@ -71,6 +71,10 @@ class Coordinates:
         nodes = [node.model_copy(update={"C": _floats(fractions(node.C) @ self.inverse)}) for node in given.nodes]
         return given.model_copy(update={"plant": plant.model_copy(update=moved), "nodes": tuple(nodes)})
 
+    def states(self, x: Array) -> Array:
+        """T x of every row of x, (any, nx), rounded."""
+        return _floats(fractions(x) @ fractions(self.T).T)
+
     def there(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
         """Gains of the problem that was given, for `problem`; where they are unbiased K_ii is what the others leave."""
         if self._given.unbiased:

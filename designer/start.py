@@ -11,9 +11,12 @@ import math
 from fractions import Fraction
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from designer.coordinates import fractions
 from designer.gain.exact import exact_gain
 from designer.gain.start import corners, is_many, left_by_start
 from designer.ladder import rounded_up
@@ -39,15 +42,17 @@ def from_start(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | No
         return None
     gamma = exact_gain(model_of_gains(problem, K, H)).high
     known = single_run_of(problem, K, H, gamma, P) if math.isfinite(gamma) else None
-    gamma_P, V = (None, None) if known is None else (known[0], value_of(problem, known[1]))
+    gamma_P, V = (None, None) if known is None else (known.gamma, value_of(problem, known.P, known.T))
     return FromStart(left_by_start(problem, K, H), gamma_P, V)
 
 
-def value_of(problem: Problem, P: Array) -> float:
-    """eta(0)'P(r(0))eta(0) for the worst x(0) within the initial error: exact, rounded up."""
+def value_of(problem: Problem, P: Array, T: Array | None = None) -> float:
+    """eta(0)'P(r(0))eta(0) for the worst x(0) within the initial error: exact, rounded up. P is of [T x; T e]."""
     P_s, nx = P[problem.mode_index(problem.markov.initial)], problem.nx
     blocks = [[[Fraction(float(entry)) for entry in P_s[i::nx, j::nx].ravel()] for j in range(nx)] for i in range(nx)]
     weights = [[sum(block, Fraction(0)) for block in row] for row in blocks]
+    if T is not None:
+        weights = (fractions(T).T @ np.array(weights, dtype=object) @ fractions(T)).tolist()
     if is_many(problem):
         weights = [[abs(weight) for weight in row] for row in weights]
     most = max(

@@ -27,6 +27,7 @@ from designer.search.baselines import BASELINES, design_baseline
 from designer.search.descent import Budget, Progress, to_its_end
 from designer.search.effort import BUDGET, default_method
 from designer.search.exact_design import certify, confirmed, design_exact, lower_end
+from designer.search.lmi_apart import design_apart
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 _PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
@@ -71,7 +72,7 @@ def design(
         if method == EXACT:
             gains = _exact_in_natural_units(problem, budget, progress, dask, peak_slack)
         else:
-            gains = _with_exact(design_by_lmi(problem, method))
+            gains = _with_exact(design_apart(problem, method) or design_by_lmi(problem, method))
     except Unattainable as error:
         raise explained(problem, error, _solvable) from None
     least = floor_below(problem, gains.certificate.gamma)
@@ -175,6 +176,8 @@ def _with_exact(gains: Gains) -> Gains:
     The P that an LMI gave satisfies (17), so it ends the recursion too. Not for networks where that takes too long.
     """
     problem, certificate = gains.problem, gains.certificate
+    if certificate.kind == "exact":  # there is nothing beside it
+        return gains
     if problem.n * problem.nx > _LADDER_STATES:
         return gains
     started = time.perf_counter()

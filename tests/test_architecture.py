@@ -53,15 +53,15 @@ ROOMS = {
     "designer.model": "designer.coordinates",
     "designer.gain": "designer.coordinates designer.decay designer.model",
     "designer.proof": "designer.coordinates designer.decay",
-    "designer.lmi": "designer.gain designer.model designer.proof",
+    "designer.lmi": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.workers": "",
     "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
     "designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
-    "designer.single_run": "designer.gain designer.model designer.proof",
-    "designer.start": "designer.gain designer.ladder designer.model designer.single_run",
+    "designer.single_run": "designer.coordinates designer.gain designer.model designer.proof",
+    "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
     "designer.box": "designer.decay designer.gain designer.ladder designer.model designer.proof designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "

@@ -10,9 +10,10 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 from designer.decay import decay
 from designer.gain.exact import Operator
-from designer.model.error_model import error_model, stacked_links
+from designer.model.error_model import model_of_gains
 
 _MOST_STEPS = 20_000
 _CORNERS = 10  # states whose signs are all tried; of more, each entry counts by its absolute value
@@ -25,7 +26,7 @@ def left_by_start(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> float |
     Y(k) = L^k(M'M) weighs eta(0) after k steps. With Z - L(Z) > 0 and Y(k) <= c Z none of the later ones weighs it by
     more than c Z does, so the search for the largest ends.
     """
-    model, s = error_model(problem, *stacked_links(problem, K, H)), problem.mode_index(problem.markov.initial)
+    model, s = model_of_gains(problem, K, H), problem.mode_index(problem.markov.initial)
     operator = Operator(model)
     Z = decay(operator.corner, model.modes, operator.units, operator.model.moves).total
     if Z is None:
@@ -34,7 +35,7 @@ def left_by_start(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> float |
         inverse = np.linalg.inv(np.linalg.cholesky(Z))
     except np.linalg.LinAlgError:
         return None
-    tried, of_Z = corners(problem), _weighed(Z[s], problem)
+    tried, of_Z = _tried(problem), _weighed(Z[s], problem)
     Y, most = np.asarray(operator.MM), 0.0
     for _ in range(_MOST_STEPS):
         most = max(most, _largest(_weighed(Y[s], problem), tried))
@@ -51,6 +52,14 @@ def corners(problem: Problem) -> Array:
         return np.abs(problem.initial_error)[None]
     signs = itertools.product(*([(1.0,)] + [(1.0, -1.0)] * (problem.nx - 1)))
     return np.array(list(signs)) * problem.initial_error
+
+
+def _tried(problem: Problem) -> Array:
+    """The corners in the coordinates of `model_of_gains`; of too many, |T x| is at most |T||x|."""
+    coordinates, found = Coordinates.of(problem), corners(problem)
+    if coordinates is None:
+        return found
+    return found @ np.abs(coordinates.T).T if is_many(problem) else coordinates.states(found)
 
 
 def is_many(problem: Problem) -> bool:

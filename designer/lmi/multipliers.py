@@ -14,6 +14,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 from designer.lmi import conic
 from designer.lmi.attempts import SOLVED
 from designer.lmi.cones import Indices
@@ -37,11 +38,12 @@ def least_of_lmi(problem: Problem) -> float | None:
 
 def _by_multipliers(problem: Problem) -> float | None:
     """The first that prove anything, and between them and those before them, which are closer to the optimum."""
-    before = None
-    for V in multipliers(problem) if problem.n * problem.nx <= MOST_STATES else ():
-        if at_least(problem, V) is not None:
+    coordinates, before = Coordinates.of(problem), None
+    given, T = (problem, None) if coordinates is None else (coordinates.problem, coordinates.T)
+    for V in multipliers(given) if problem.n * problem.nx <= MOST_STATES else ():
+        if at_least(problem, V, T) is not None:
             mixed = (V if before is None else before + part * (V - before) for part in _PARTS)
-            return next(gamma for U in mixed if (gamma := at_least(problem, U)) is not None)
+            return next(gamma for U in mixed if (gamma := at_least(problem, U, T)) is not None)
         before = V
     return None
 

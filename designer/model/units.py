@@ -65,11 +65,12 @@ class NaturalUnits:
 
     So it is the same problem, number by number, and gains go to and fro without rounding: whatever is found in these
     units does not depend, by a single bit, on the powers of two that somebody measures in. Where M cancels, that is so
-    of the problem in other `coordinates`, and to get there takes a rounding.
+    of the problem in other `coordinates`, and to get there takes a rounding; 2^-53 `magnified` (nx, nx) is how far, in
+    its natural unit, z moves as an entry of K_ij that is 1 here is rounded on the way back.
     """
 
     def __init__(self, problem: Problem, coordinates: Coordinates | None = None) -> None:
-        self.coordinates, self.held = coordinates, None
+        self.coordinates, self.magnified = coordinates, None
         given, problem = problem, problem if coordinates is None else coordinates.problem
         self.state = _power(natural_units(problem).state)
         self.y = [
@@ -84,7 +85,12 @@ class NaturalUnits:
         ]
         self.names, self.problem = problem.node_names, scaled.model_copy(update={"nodes": tuple(nodes)})
         if coordinates is not None:
-            self.held = _held(coordinates, natural_units(given).state, self.state)
+            self.magnified = _magnified(coordinates, natural_units(given).state, self.state)
+
+    @property
+    def held(self) -> NDArray[np.bool_] | None:
+        """Entries (nx, nx) of K_ij that a search holds at 0, as no file could hold them if they were near 1."""
+        return None if self.magnified is None else self.magnified > _MOST
 
     def there(self, K: LinkMatrices, H: LinkMatrices) -> tuple[LinkMatrices, LinkMatrices]:
         """Gains of the problem that was given, in the units of `problem`."""
@@ -102,15 +108,14 @@ class NaturalUnits:
         return (K, H) if self.coordinates is None else self.coordinates.back(K, H)
 
 
-def _held(coordinates: Coordinates, given: Array, state: Array) -> NDArray[np.bool_]:
-    """Entries (nx, nx) of K_ij in these coordinates, (T K_ij T^-1)_ab, that no file could hold if they were near 1.
+def _magnified(coordinates: Coordinates, given: Array, state: Array) -> Array:
+    """`NaturalUnits.magnified`; `given` and `state`: natural units among the states and in these coordinates.
 
-    Back among the states they are large numbers, as they multiply what cancels; rounded, they would move z by more
-    than is left of it. `given` and `state`: natural units there and here.
+    Back among the states an entry that makes much of what cancels is large, and moves z as a rounding of it does.
     """
     columns = np.abs(coordinates.inverse.astype(np.float64)).T / given  # of T^-1
     left, right = state * columns.max(axis=1), (np.abs(coordinates.T) * given).max(axis=1) / state
-    return np.asarray(np.outer(left, right) * right.max() > _MOST)
+    return np.asarray(np.outer(left, right) * right.max())
 
 
 def _divided(gains: LinkMatrices, rows: Array, by: dict[str, Array]) -> LinkMatrices:

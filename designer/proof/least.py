@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.proof.ball_model import told
-from designer.proof.balls import diagonal, part, sign
+from designer.proof.balls import diagonal, exact, identity, part, sign
 from designer.proof.by_balls import symmetric
 
 _BITS = 256
@@ -34,25 +34,29 @@ _BITS = 256
 Indices = NDArray[np.intp]
 
 
-def at_least(problem: Problem, V: Array) -> float | None:
+def at_least(problem: Problem, V: Array, T: Array | None = None) -> float | None:
     """gamma that no gains and no P = diag{R, Q(s)} satisfy (17) and (18) below; None where V proves nothing.
 
-    V (modes, n_eta + nw, n_eta + nw): weights, of which (V + V')/2 counts. Rows of zeros weigh nothing.
+    V (modes, n_eta + nw, n_eta + nw): weights, of which (V + V')/2 counts. Rows of zeros weigh nothing. With T (nx, nx)
+    they weigh [T x; T e; w], where signs are looked at too.
     """
     if not np.isfinite(V).all():
         return None
     with ctx.workprec(_BITS):
         try:
-            return _proved(problem, symmetric(V), [np.flatnonzero(V_s.any(axis=0) | V_s.any(axis=1)) for V_s in V])
+            weighed = [np.flatnonzero(V_s.any(axis=0) | V_s.any(axis=1)) for V_s in V]
+            return _proved(problem, symmetric(V), weighed, None if T is None else exact(T))
         except ZeroDivisionError:  # a matrix that is singular, as far as balls know it
             return None
 
 
-def _proved(problem: Problem, V: list[arb_mat], weighed: list[Indices]) -> float | None:
+def _proved(problem: Problem, V: list[arb_mat], weighed: list[Indices], T: arb_mat | None) -> float | None:
     nx, p, nw, pi = problem.nx, problem.plant_states, problem.nw, told(problem).transition
     if not all(_positive(part(V_s, at.tolist(), at.tolist())) for V_s, at in zip(V, weighed, strict=True)):
         return None
-    if p and not _positive(_left_for_R(problem, V)):
+    if T is not None:
+        V, weighed = _among_states(problem, V, weighed, T.inv())
+    if p and not _positive(_turned(_left_for_R(problem, V), T)):
         return None
     M, gained, spent = _balls(_rational(problem.plant.M)), arb(0), arb(0)
     for i in range(problem.n):
@@ -60,13 +64,33 @@ def _proved(problem: Problem, V: list[arb_mat], weighed: list[Indices]) -> float
         residuals = [_residual(regression(problem, s, i), V_s, weighed[s]) for s, V_s in enumerate(V)]
         for t, V_t in enumerate(V):
             U = sum((Res * _ball(pi[s][t]) for s, Res in enumerate(residuals)), arb_mat(nx, nx)) - part(V_t, e_i, e_i)
-            if np.isin(e_i, weighed[t]).any() and not _positive(U):  # else U is a sum of Res >= 0
+            if np.isin(e_i, weighed[t]).any() and not _positive(_turned(U, T)):  # else U is a sum of Res >= 0
                 return None
             gained += _trace(M * U * M.transpose()) * arb(float(problem.weights[i])) ** 2
     for V_s in V:
         w = range(V_s.nrows() - nw, V_s.nrows())
         spent += _trace(part(V_s, w, w))
     return float_below((gained / spent).sqrt()) if gained > 0 and spent > 0 else None
+
+
+def _among_states(
+    problem: Problem, V: list[arb_mat], weighed: list[Indices], inverse: arb_mat
+) -> tuple[list[arb_mat], list[Indices]]:
+    """Weights on [T x; T e; w] as they weigh [x; e; w]."""
+    nx, size = problem.nx, V[0].nrows()
+    back, firsts = identity(size), range(0, size - problem.nw, nx)
+    for first in firsts:
+        for i, j in np.ndindex(nx, nx):
+            back[first + i, first + j] = inverse[i, j]
+    w = np.arange(size - problem.nw, size)
+    together = [*(np.arange(first, first + nx) for first in firsts), *w[:, None]]
+    weighed = [np.concatenate([at for at in together if np.isin(at, found).any()]) for found in weighed]
+    return [back * V_s * back.transpose() for V_s in V], weighed
+
+
+def _turned(U: arb_mat, T: arb_mat | None) -> arb_mat:
+    """T U T', whose sign is that of U."""
+    return U if T is None else T * U * T.transpose()
 
 
 def _left_for_R(problem: Problem, V: list[arb_mat]) -> arb_mat:

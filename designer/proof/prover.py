@@ -72,7 +72,7 @@ class Prover:
     ) -> None:
         self._problem, self._K, self._H, self._given, self._makes = problem, K, H, P, makes
         chosen = Coordinates.of(problem) if P is None and T is None else None
-        self._T = T if chosen is None else chosen.T
+        self.T = T if chosen is None else chosen.T
         self._made: list[Arithmetic] = []
         self._known: dict[int, list[_Answer]] = {}  # by a P of `_invariants`, which stays
 
@@ -88,7 +88,7 @@ class Prover:
 
     @cached_property
     def _floats(self) -> ByFloats:
-        return ByFloats(self._problem, self._K, self._H, T=self._T)
+        return ByFloats(self._problem, self._K, self._H, T=self.T)
 
     def theorem1(self, gamma: float) -> Verdict:
         """(17) and (18) in every mode."""
@@ -217,7 +217,7 @@ class Prover:
     def _arithmetic(self, k: int) -> Arithmetic:
         while len(self._made) <= k:
             make = self._makes[len(self._made)]
-            made = self._floats if make is ByFloats else make(self._problem, self._K, self._H, T=self._T)
+            made = self._floats if make is ByFloats else make(self._problem, self._K, self._H, T=self.T)
             self._made.append(made)
         return self._made[k]
 

@@ -20,15 +20,20 @@ from designer.coordinates import Coordinates, fractions
 from designer.gain.exact import exact_gain, node_gains
 from designer.gain.noise import long_run, steady_state
 from designer.gain.worst_case import worst_fixed
+from designer.lmi.multipliers import least_of_lmi, multipliers
 from designer.model.error_model import link_gains, model_of_gains
 from designer.model.units import NaturalUnits
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import part
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
+from designer.proof.certificate import verify
+from designer.proof.least import at_least
 from designer.search.descent import Budget
 from designer.search.exact_design import certify, design_exact
+from designer.search.lmi_apart import design_apart
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
+from designer.start import from_start
 
 KINDS: dict[str, dict[str, Any]] = {
     "hidden losses": {},
@@ -251,3 +256,81 @@ def test_gains_of_each_node_and_noise_are_told() -> None:
     assert facts.noise is not None
     assert facts.gains is not None
     assert math.sqrt(facts.noise.total) < 1e-8
+
+
+def test_what_an_initial_error_adds_is_what_sums_of_it_add() -> None:
+    """The gains forget it; at step 0 it leaves |M x(0)| of each node, which is what is found and what P knows of."""
+    document = cancelling(1e-10).document()
+    document["plant"]["initial_error"] = [0.1, 0.1, 0.0]
+    problem = Problem.from_document(document)
+    gains = good_gains(problem)
+    start = from_start(problem, *gains)
+    assert start is not None
+    assert start.alone is not None
+    assert start.gamma_P is not None
+    assert start.V is not None
+    assert start.alone == pytest.approx(0.2 * math.sqrt(2.0), rel=1e-9)
+    assert start.gamma_P**2 * start.V >= start.alone**2
+    assert exact_gain(model_of_gains(problem, *gains)).low < start.gamma_P < 1e-8
+
+
+# the LMI
+@pytest.fixture(scope="module")
+def driven() -> Problem:
+    """One node whose noise is its own, and a w of its own in z: the LMI has an optimum with weights everywhere."""
+    return Problem.from_document(
+        {
+            "name": "driven",
+            "plant": {
+                "A": [[0.5, 0.1], [0.1, 0.5]],
+                "B": [[0.7, 0.0, 3e-7], [0.7, 0.0, 0.0]],
+                "M": [[1.0, -1.0000001]],
+            },
+            "node": [{"name": "a", "C": [[0.2, -0.6]], "D": [[0.0, 0.6, 0.0]], "arrival_probability": 0.8}],
+            "topology": [{"name": "one", "adjacency": [[1.0]]}],
+            "markov": {"transition": [[1.0]], "initial": "one"},
+        }
+    )
+
+
+def test_what_the_LMI_cannot_undercut_is_proved_of_the_states_as_they_are(driven: Problem) -> None:
+    """Weights on [T x; T e; w] prove the same of both; too much weight on w proves less, and none that is not >= 0."""
+    coordinates = Coordinates.of(driven)
+    assert coordinates is not None
+    V = next(multipliers(coordinates.problem))
+    there, here = at_least(coordinates.problem, V), at_least(driven, V, coordinates.T)
+    assert there is not None
+    assert here == pytest.approx(there, rel=1e-9)
+    assert at_least(driven, V) is None, "which are no weights on [x; e; w]"
+    V[0, -1, -1] *= 1.01
+    less = at_least(driven, V, coordinates.T)
+    assert less is not None
+    assert less < there
+    V[0, -1, -1] *= -1.0
+    assert at_least(driven, V, coordinates.T) is None
+
+
+def test_gains_of_the_LMI_come_near_its_optimum(driven: Problem) -> None:
+    """Which lies between what is proved from below and what the solver says, not a thousandfold above."""
+    gains, least = design_apart(driven, "decomposed"), least_of_lmi(driven)
+    assert gains is not None
+    assert least is not None
+    assert gains.certificate.lmi_gamma == pytest.approx(least, rel=1e-3)
+    assert gains.certificate.gamma < 1.01 * least
+    assert verify(gains).holds
+
+
+def test_the_P_of_an_LMI_is_stored_where_it_proves_something() -> None:
+    document = cancelling(1e-3).document()
+    document["topology"] = document["topology"][:1]
+    document["markov"] = {"transition": [[1.0]], "initial": "one"}
+    gains = design_apart(Problem.from_document(document), "decomposed")
+    assert gains is not None
+    assert gains.certificate.kind == "lyapunov"
+    assert gains.certificate.lmi_gamma is not None
+    assert gains.certificate.gamma < 1.002 * gains.certificate.lmi_gamma
+    assert verify(gains).holds
+
+
+def test_where_nothing_cancels_the_LMI_is_solved_as_ever() -> None:
+    assert design_apart(problems.find("two-nodes"), "decomposed") is None

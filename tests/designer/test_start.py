@@ -94,7 +94,7 @@ def test_a_bound_that_forgets_the_start_is_refuted(gains: Gains) -> None:
 def test_the_value_of_the_start_is_exact(gains: Gains) -> None:
     known = single_run(gains)
     assert known is not None
-    _, P = known
+    P = known.P
     problem, s = gains.problem, gains.problem.mode_index(gains.problem.markov.initial)
     for sign in (1, -1):
         eta = np.tile([Fraction(0.1), sign * Fraction(0.3)], problem.n + (1 if problem.plant_states else 0))
