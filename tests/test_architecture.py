@@ -63,7 +63,8 @@ ROOMS = {
     "designer.single_run": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
-    "designer.box": "designer.decay designer.gain designer.ladder designer.model designer.proof designer.search",
+    "designer.box": "designer.coordinates designer.decay designer.gain designer.ladder designer.model designer.proof "
+    "designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
     "designer.model designer.proof designer.search",
     "designer.stacked": "designer.model",

@@ -22,6 +22,7 @@ from agent.contract.problem import Problem
 from designer.box.extent import Box
 from designer.box.robust import Robust, robust
 from designer.box.worst import real, worst
+from designer.coordinates import Coordinates
 from designer.gain.exact import Operator, horizon_gain
 from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
@@ -151,9 +152,9 @@ class _Search:
         progress: Callable[[Progress], None] | None,
     ) -> None:
         self.problem, self.box, self.budget, self.progress = problem, box, budget, progress
-        self.natural = NaturalUnits(problem)
+        self.natural = NaturalUnits(problem, None if box.entries else Coordinates.of(problem))
         self.natural_box = box._replace(entries=tuple(_scaled(entry, self.natural) for entry in box.entries))
-        self.barrier = Barrier(self.natural.problem, _HORIZON)
+        self.barrier = Barrier(self.natural.problem, _HORIZON, held=self.natural.held)
         self.longest = longest_horizon(problem)
         there = self.natural.there(start.K, start.H)
         self.v = self.begin = self.barrier.entries.pack(*stacked_links(self.natural.problem, *there))

@@ -12,7 +12,7 @@ from agent.contract.problem import Problem
 from agent.contract.problem.uncertainty import Tolerance
 from designer.box.extent import Box, box_of, corners
 from designer.box.robust import ends, invariant, weights_of
-from designer.box.worst import real_model
+from designer.box.worst import There
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import told
@@ -97,7 +97,8 @@ def _work(problem: Problem, box: Box) -> float:
 
 def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> Radius:
     """Four times as large as long as floats see an end, then in halves until it is known to a fiftieth; then proved."""
-    nominal = real_model(problem, K, H, told(problem)._replace(carry=shape.box(problem, _LARGEST).carry))
+    largest = shape.box(problem, _LARGEST)
+    nominal = There.of(problem, K, H, largest).model(told(problem)._replace(carry=largest.carry))
     weights = weights_of(nominal, RAISED**2 - 1.0)
 
     def size(parts: int) -> Fraction:
@@ -135,6 +136,7 @@ def attempted(
     weights: Array,
 ) -> Attempt | None:
     """With the weights of the nominal model; None: as far as floats tell this gamma is not proved so."""
-    by = ByVertices([Cube(problem, K, H, corner, box.entries) for corner in corners(problem, box)], weights)
+    T = There.of(problem, K, H, box).T
+    by = ByVertices([Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)], weights)
     P = invariant(by, Operator(nominal))
     return Attempt(by, P) if P is not None and ends(by, P, gamma**2, _STEPS) else None

@@ -11,7 +11,7 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, corners
-from designer.box.worst import Worst, real_model, worst
+from designer.box.worst import There, Worst, worst
 from designer.decay import decay, is_positive, scaled
 from designer.gain.exact import Operator, exact_gain
 from designer.gain.sensitivity import sweep
@@ -137,7 +137,9 @@ def proved_at(
         if P is not None and ends(by, P, gamma**2):
             arithmetic: Arithmetic = by
             if balls:
-                arithmetic = VerticesByBalls(problem, K, H, [model.truth for model in models], box.entries, by)
+                arithmetic = VerticesByBalls(
+                    problem, K, H, [model.truth for model in models], box.entries, by, T=models[0].T
+                )
             verdict = prove(arithmetic, problem.mode_names, gamma, P)
             if verdict.holds:
                 break
@@ -149,8 +151,9 @@ def _models(
 ) -> tuple[list[Cube], list[ErrorModel]]:
     """What stands at the corners, the likely worst first; and models whose worst w makes weights, the nominal last."""
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))
-    likely = [real_model(problem, K, H, each) for each in (truth, told(problem)._replace(carry=box.carry))]
-    return [Cube(problem, K, H, corner, box.entries) for corner in every], likely
+    there = There.of(problem, K, H, box)
+    likely = [there.model(each) for each in (truth, told(problem)._replace(carry=box.carry))]
+    return [Cube(problem, K, H, corner, box.entries, there.T) for corner in every], likely
 
 
 def _sought(

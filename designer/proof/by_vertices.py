@@ -125,6 +125,8 @@ def upper_bound(S: Array, X: Array) -> Array:
     No least upper bound of matrices exists. From the S of the largest tr(XS) on, one after the other adds the part of
     it that is above Z: with X = FF', the positive part of F'(S - Z)F.
     """
+    d = weights(X.diagonal(axis1=1, axis2=2))  # in units in which X has about 1 on its diagonal
+    X, S = X * d[:, :, None] * d[:, None, :], S / d[:, :, None] / d[:, None, :]
     values, vectors = np.linalg.eigh(X)
     roots = np.sqrt(np.maximum(values, _LEAST * values[:, -1:]))
     F, inverse = vectors * roots[:, None, :], (vectors / roots[:, None, :]).swapaxes(1, 2)
@@ -138,7 +140,7 @@ def upper_bound(S: Array, X: Array) -> Array:
     Z, i = (Z + Z.swapaxes(1, 2)) / 2.0, np.arange(Z.shape[1])
     lacking = -np.linalg.eigvalsh((Z - S) * D[:, :, None] * D[:, None, :])[..., 0].min(axis=0)
     Z[:, i, i] += (np.maximum(lacking, 0.0) + _ABOVE)[:, None] / D**2
-    return np.asarray(Z)
+    return np.asarray(Z * d[:, :, None] * d[:, None, :])
 
 
 def prove(by: Arithmetic, modes: tuple[str, ...], gamma: float, P: Array) -> Verdict:

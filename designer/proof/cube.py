@@ -75,11 +75,19 @@ class Cube(ByFloats):
     """`ByFloats` for the model in the middle; `joint` and `above` for all."""
 
     def __init__(
-        self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth, entries: tuple[Entry, ...]
+        self,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        truth: Truth,
+        entries: tuple[Entry, ...],
+        T: Array | None = None,
     ) -> None:
-        self.truth = truth
+        self.truth, self.T = truth, T
+        if entries and T is not None:
+            raise ValueError("an entry that is off is one of the matrices as they are, not of those that T makes")
         with ctx.workprec(BITS):
-            balls = BallModel(problem, K, H, truth)
+            balls = BallModel(problem, K, H, truth, T)
             self._begin(balls)
             self.deviations = Deviations(balls, problem, entries)
             self._left, self._right = self._terms(balls)

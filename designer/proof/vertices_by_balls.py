@@ -28,9 +28,15 @@ class CubeByBalls:
     """S(Y) of every model of a cube from above, as `designer.proof.cube.Cube` in floats."""
 
     def __init__(
-        self, problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth, entries: tuple[Entry, ...]
+        self,
+        problem: Problem,
+        K: LinkMatrices,
+        H: LinkMatrices,
+        truth: Truth,
+        entries: tuple[Entry, ...],
+        T: Array | None = None,
     ) -> None:
-        self.model = BallModel(problem, K, H, truth)
+        self.model = BallModel(problem, K, H, truth, T)
         self.deviations = Deviations(self.model, problem, entries)
         self.terms: list[list[Term]] = [self.deviations.terms(s) for s in self.model.modes]
 
@@ -100,11 +106,12 @@ class VerticesByBalls(ByBalls):
         found: ByVertices,
         *,
         bits: int = 128,
+        T: Array | None = None,
     ) -> None:
         self.bits, self.found = bits, found
         self.name = f"ball arithmetic of {bits} bits (flint {flint.__version__}), at {len(corners)} corners"
         with ctx.workprec(bits):
-            self.corners = [CubeByBalls(problem, K, H, corner, entries) for corner in corners]
+            self.corners = [CubeByBalls(problem, K, H, corner, entries, T) for corner in corners]
         self.model = self.corners[0].model
         self.order = self.model.size
 

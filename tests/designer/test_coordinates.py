@@ -16,6 +16,9 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer import problems
 from designer.beyond_gamma import beyond_gamma
+from designer.box.extent import Box, box_of, corners, within
+from designer.box.robust import proved_at, robust
+from designer.box.worst import There, worst
 from designer.coordinates import Coordinates, fractions
 from designer.gain.exact import exact_gain, node_gains
 from designer.gain.noise import long_run, steady_state
@@ -27,7 +30,9 @@ from designer.proof.ball_model import BallModel
 from designer.proof.balls import part
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
+from designer.proof.by_vertices import upper_bound
 from designer.proof.certificate import verify
+from designer.proof.cube import Cube
 from designer.proof.least import at_least
 from designer.search.descent import Budget
 from designer.search.exact_design import certify, design_exact
@@ -334,3 +339,55 @@ def test_the_P_of_an_LMI_is_stored_where_it_proves_something() -> None:
 
 def test_where_nothing_cancels_the_LMI_is_solved_as_ever() -> None:
     assert design_apart(problems.find("two-nodes"), "decomposed") is None
+
+
+# the box
+@pytest.fixture(scope="module")
+def boxed() -> tuple[Problem, LinkMatrices, LinkMatrices, Box]:
+    problem = cancelling(1e-10)
+    return problem, *good_gains(problem), box_of(problem, within(["probabilities=0.001"]))
+
+
+def test_a_box_of_probabilities_is_proved_where_M_cancels(
+    boxed: tuple[Problem, LinkMatrices, LinkMatrices, Box],
+) -> None:
+    """The worst model found has no less than the model of the file and no more than what is proved, by balls too."""
+    problem, K, H, box = boxed
+    found = robust(problem, K, H, box)
+    gain = exact_gain(model_of_gains(problem, K, H))
+    assert found.gamma is not None
+    assert gain.low < found.found < found.gamma < 1.1 * gain.high
+    for gamma, holds in ((found.gamma, True), (gain.low, False)):
+        again = proved_at(problem, K, H, box, found.worst.truth, gamma, balls=True)
+        assert (again is not None and again.holds) is holds
+
+
+def test_the_worst_model_of_a_box_is_what_600_bits_say_it_is(
+    boxed: tuple[Problem, LinkMatrices, LinkMatrices, Box],
+) -> None:
+    problem, K, H, box = boxed
+    found = worst(problem, K, H, box)
+    bits = ManyBits(problem, K, H)
+    with ctx.workprec(600):
+        bits.by.model = BallModel(problem, K, H, found.truth)
+    assert not bits.holds(bits.by.model.M, found.gain * (1.0 - 1e-6), 40)
+    assert bits.holds(bits.by.model.M, found.gain * (1.0 + 1e-4), 40)
+
+
+def test_an_entry_that_is_off_is_one_of_the_matrices_as_they_are(
+    boxed: tuple[Problem, LinkMatrices, LinkMatrices, Box],
+) -> None:
+    """So a box of entries is seen among the states, and T is refused for it."""
+    problem, K, H, _ = boxed
+    box = box_of(problem, within(["B=1%"]))
+    assert There.of(problem, K, H, box).T is None
+    with pytest.raises(ValueError, match="an entry that is off"):
+        Cube(problem, K, H, corners(problem, box)[0], box.entries, np.eye(3))
+
+
+def test_what_is_above_all_corners_does_not_depend_on_units() -> None:
+    rng = np.random.default_rng(0)
+    X, S = (V @ V.swapaxes(-1, -2) for V in (rng.normal(size=(2, 4, 4)), rng.normal(size=(3, 2, 4, 4))))
+    units = np.array([2.0**20, 1.0, 2.0**-20, 2.0**3])
+    both = np.outer(units, units)
+    np.testing.assert_allclose(upper_bound(S * both, X / both), upper_bound(S, X) * both, rtol=1e-12)
