@@ -36,6 +36,10 @@ from designer.model.error_model import model_of_gains
 from designer.proof.prover import Prover
 from designer.search.exact_design import SLOW, certify, confirmed, lower_end
 
+_STEPS_IF_SLOW = 2000  # of the worst policy, of errors that decay slowly; more are not looked at
+_SHORT = 1e-3  # a policy that attains less than the exact gain by so much of it is said to
+_NEAR_1 = 1e-4  # rates nearer to 1 are told by what is left to it
+
 
 class GivenGains(NamedTuple):
     """Gains for the links of a problem, and where they come from."""
@@ -64,6 +68,7 @@ class Analysis(NamedTuple):
     ladder: Ladder
     mode: str | None  # of the worst policy: where it begins
     steps: int  # of the worst policy, from the first w to the peak
+    policy_gain: float | None  # what it attains
     u: Array | None  # (nw,): its first w
     fixed: float | None  # the gain to the worst w that is fixed beforehand, from r(0) = initial
     fixed_within: int  # the steps that it was sought over
@@ -94,7 +99,7 @@ class Analysis(NamedTuple):
             "ladder": self.ladder.document(),
             "worst_policy": None
             if self.u is None
-            else {"mode": self.mode, "steps": self.steps, "first_w": self.u.tolist()},
+            else {"mode": self.mode, "steps": self.steps, "gain": self.policy_gain, "first_w": self.u.tolist()},
             "worst_fixed": None
             if self.w is None
             else {
@@ -115,6 +120,12 @@ class Analysis(NamedTuple):
             return ""
         return f": {_steps(self.horizon)} {'shows' if self.horizon == 1 else 'show'} that it is no less"
 
+    def _short_of(self, low: float) -> str:
+        """Where errors decay so slowly that the worst policy takes more steps than are looked at."""
+        if self.policy_gain is None or self.policy_gain >= (1.0 - _SHORT) * low:
+            return ""
+        return f"; its gain is {self.policy_gain:.6g}, and it takes more steps to come to the exact one"
+
     @property
     def _rate_is_credible(self) -> bool:
         """Eigenvalues are in floats; no proof says that these are wrong."""
@@ -124,6 +135,8 @@ class Analysis(NamedTuple):
         if not self._rate_is_credible:
             return "how fast in the long run, floats do not tell"
         rate = f"{self.radius:.{digits}g}" if math.isfinite(self.radius) else "more than a float64 holds"
+        if 0.0 < abs(self.radius - 1.0) < _NEAR_1:
+            rate = f"1 {'-' if self.radius < 1.0 else '+'} {abs(1.0 - self.radius):.3g}"
         return f"computed: in the long run each step multiplies E|error|^2 by {rate}"
 
     def text(self) -> str:
@@ -162,7 +175,7 @@ class Analysis(NamedTuple):
             *([] if self.robust is None else self.robust.lines()),
             *(f"radius     {radius.line()}" for radius in self.radii),
             f'worst w    that sees the past: w = 0 until mode "{self.mode}", then w along {_vector(self.u)}{then}; '
-            f"E|z~|^2 peaks {_steps(self.steps)} after the first w",
+            f"E|z~|^2 peaks {_steps(self.steps)} after the first w{self._short_of(low)}",
             f"           that is fixed beforehand: gain {self.fixed:.6g} "
             f'from mode "{problem.markov.initial}" '
             f"over {_steps(self.fixed_within)}",
@@ -244,7 +257,7 @@ def analyse(
     ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)
     if not gain.stable:
         stable = Prover(problem, given.K, given.H).stable.holds
-        return Analysis(problem, given, stable, gain.radius, gain.horizon, ladder, None, 0, None, None, 0, None)
+        return Analysis(problem, given, stable, gain.radius, gain.horizon, ladder, None, 0, None, None, None, 0, None)
     verdict = confirmed(problem, given.K, given.H, gain.high)
     if verdict.holds:
         ladder = ladder._replace(exact=(lower_end(problem, given.K, given.H, gain), verdict.gamma))
@@ -252,7 +265,7 @@ def analyse(
     if in_box is not None:
         found = in_box.found if math.isfinite(in_box.found) else None
         ladder = ladder._replace(found_in_box=found, proved_in_box=in_box.gamma)
-    policy = worst_policy(model, horizon=gain.horizon)
+    policy = worst_policy(model, horizon=gain.horizon if gain.radius < SLOW else max(gain.horizon, _STEPS_IF_SLOW))
     fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
         problem=problem,
@@ -267,6 +280,7 @@ def analyse(
         ),
         mode=problem.mode_names[policy.mode],
         steps=len(policy.Gamma) + 1,
+        policy_gain=policy.gamma,
         u=policy.u * (-1.0 if policy.u[np.abs(policy.u).argmax()] < 0.0 else 1.0),
         fixed=fixed.gain,
         fixed_within=fixed.within,
