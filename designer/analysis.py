@@ -27,16 +27,16 @@ from designer.box.extent import Box
 from designer.box.radius import Radius, radii
 from designer.box.robust import Robust, robust
 from designer.diagnosis import refuse_nothing_to_estimate
-from designer.gain.exact import exact_gain
+from designer.gain.exact import Gain, exact_gain
 from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
 from designer.ladder import Ladder, interval
 from designer.lmi import beyond_paper
-from designer.model.error_model import model_of_gains
+from designer.model.error_model import ErrorModel, model_of_gains
 from designer.proof.prover import Prover
 from designer.search.exact_design import SLOW, certify, confirmed, lower_end
 
-_STEPS_IF_SLOW = 2000  # of the worst policy, of errors that decay slowly; more are not looked at
+_MOST_OF_POLICY = 2000, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
 _SHORT = 1e-3  # a policy that attains less than the exact gain by so much of it is said to
 _NEAR_1 = 1e-4  # rates nearer to 1 are told by what is left to it
 
@@ -265,7 +265,7 @@ def analyse(
     if in_box is not None:
         found = in_box.found if math.isfinite(in_box.found) else None
         ladder = ladder._replace(found_in_box=found, proved_in_box=in_box.gamma)
-    policy = worst_policy(model, horizon=gain.horizon if gain.radius < SLOW else max(gain.horizon, _STEPS_IF_SLOW))
+    policy = worst_policy(model, horizon=_steps_of_policy(model, gain))
     fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
         problem=problem,
@@ -292,6 +292,14 @@ def analyse(
         if radius and verdict.holds
         else (),
     )
+
+
+def _steps_of_policy(model: ErrorModel, gain: Gain) -> int:
+    """Those that show the exact gain; where errors decay slowly it is known without, so as many as take no long time."""
+    if gain.radius < SLOW:
+        return gain.horizon
+    steps, numbers = _MOST_OF_POLICY
+    return max(gain.horizon, min(steps, int(numbers / (model.modes * model.size**2))))
 
 
 def certified(problem: Problem, given: GivenGains) -> Gains:

@@ -66,7 +66,8 @@ class Radius(NamedTuple):
         if self.beyond is not None:
             end = f"for {text(self.beyond)} that was not proved"
         if self.proved == 0.0 and self.beyond is not None:
-            return f"{self.shape.name}: for +- {text(self.beyond)} no gamma {RAISED:g} times as large was proved, nor for less"
+            none = f"no gamma {RAISED:g} times as large was proved, nor for less"
+            return f"{self.shape.name}: for +- {text(self.beyond)} {none}"
         size = f"{self.shape.name} +- {text(self.proved)}"
         return f"{size}: gamma = {self.gamma}, {RAISED:g} times as much, is proved; {end}"
 

@@ -114,6 +114,19 @@ def test_a_rate_that_is_proved_wrong_is_not_told(monkeypatch: pytest.MonkeyPatch
         assert analysis.document()["radius"] is None
 
 
+def test_near_the_border_no_sentence_of_an_analysis_contradicts_another() -> None:
+    """The rate is told by what it is below 1, and the worst policy by what it attains in the steps looked at."""
+    analysis = analyse(scalar(1.0 - 1e-7)[0], GivenGains(*scalar(1.0 - 1e-7)[1:], "by hand", None))
+    said = analysis.text()
+    assert "in the long run each step multiplies E|error|^2 by 1 - 2e-07" in said
+    assert analysis.policy_gain is not None
+    assert analysis.ladder.exact is not None
+    assert analysis.policy_gain < 0.1 * analysis.ladder.exact[0]
+    assert f"its gain is {analysis.policy_gain:.6g}, and it takes more steps" in said
+    fast = analyse(scalar(0.9)[0], GivenGains(*scalar(0.9)[1:], "by hand", None))
+    assert "takes more steps" not in fast.text()
+
+
 def operator_of(case: Case) -> Operator:
     problem, K, H = case
     return Operator(error_model(problem, *stacked_links(problem, K, H)))
