@@ -36,7 +36,7 @@ from designer.model.error_model import ErrorModel, model_of_gains
 from designer.proof.prover import Prover
 from designer.search.exact_design import SLOW, certify, confirmed, lower_end
 
-_MOST_OF_POLICY = 2000, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
+_MOST_OF_POLICY = 500, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
 _SHORT = 1e-3  # a policy that attains less than the exact gain by so much of it is said to
 _NEAR_1 = 1e-4  # rates nearer to 1 are told by what is left to it
 
@@ -295,7 +295,7 @@ def analyse(
 
 
 def _steps_of_policy(model: ErrorModel, gain: Gain) -> int:
-    """Those that show the exact gain; where errors decay slowly it is known without, so as many as take no long time."""
+    """Those that show the exact gain; where errors decay slowly it is known without, so as many as take no time."""
     if gain.radius < SLOW:
         return gain.horizon
     steps, numbers = _MOST_OF_POLICY
