@@ -17,6 +17,12 @@ class Search:
     """What signals may end."""
 
     over = False  # all that is left is to be written
+    asked = False  # a signal has come
+
+    def stepped(self) -> None:
+        """A search goes on: KeyboardInterrupt where a signal has come whose own was lost, in a callback of a library."""
+        if self.asked:
+            raise KeyboardInterrupt
 
 
 @contextmanager
@@ -27,7 +33,7 @@ def stoppable() -> Iterator[Search]:
     def stop(number: int, frame: FrameType | None) -> None:
         print(STOPPED if search.over else STOPPING, file=sys.stderr, flush=True)
         if not search.over:
-            search.over = True
+            search.over = search.asked = True
             raise KeyboardInterrupt
 
     handlers = heed(stop)

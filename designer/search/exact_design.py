@@ -39,6 +39,7 @@ _FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if n
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
+_LEAST = 100  # evaluations of the whole after windows: with less, all may be for nothing
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -104,7 +105,10 @@ def design_exact(
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
+        pressed = descent.ended == "interrupted"
+        budget = Budget(0.0) if pressed else budget
         found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress, held=held)
+        found = found._replace(ended=descent.ended) if pressed else found
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
         status = f"{_status_of_noise(found, unit)}; before: {status}"
         gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
@@ -144,7 +148,13 @@ def _by_windows(
     dask: str | None,
 ) -> Descent:
     """Windows first, from which the whole network's search goes on where there are time and memory for it."""
-    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask)
+
+    def report(done: int, of: int) -> None:
+        if progress is not None:
+            phase = f"window {done} of {of}; Ctrl-C keeps what is done"
+            progress(Progress("", WEIGHT_OF_WINDOWS, 0, math.inf, budget.spent, 0, phase=phase))
+
+    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
     descent = descend(
         problem,
@@ -152,6 +162,7 @@ def _by_windows(
         first=WEIGHT_OF_WINDOWS,
         budget=Budget(0.0) if ended else budget,
         progress=progress,
+        least=_LEAST,
     )
     return descent._replace(ended=ended) if ended else descent
 
