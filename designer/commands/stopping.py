@@ -20,7 +20,7 @@ class Search:
     asked = False  # a signal has come
 
     def stepped(self) -> None:
-        """A search goes on: KeyboardInterrupt where a signal has come whose own was lost, in a callback of a library."""
+        """A search goes on: KeyboardInterrupt where a signal came whose own was lost, in a callback of a library."""
         if self.asked:
             raise KeyboardInterrupt
 

@@ -175,17 +175,17 @@ def descend(
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     held: NDArray[np.bool_] | None = None,
-    least: int = 0,
+    fewest: int = 0,
 ) -> Descent:
     """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
 
     `held`: as `Entries` takes it.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
-    returned. Where `least` is not 0 the start is near what is sought: there is no search without time for so many
+    returned. Where `fewest` is not 0 the start is near what is sought: there is no search without time for so many
     evaluations, by what the first one takes, nor over a horizon that shows nothing of the start's exact gain.
     """
-    search = _Search(problem, Budget() if budget is None else budget, progress, held, least)
+    search = _Search(problem, Budget() if budget is None else budget, progress, held, fewest)
     ended = "converged"
     try:
         search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
@@ -216,9 +216,9 @@ class _Search:
         budget: Budget,
         progress: Callable[[Progress], None] | None,
         held: NDArray[np.bool_] | None = None,
-        least: int = 0,
+        fewest: int = 0,
     ) -> None:
-        self.problem, self.budget, self.progress, self.least = problem, budget, progress, least
+        self.problem, self.budget, self.progress, self.fewest = problem, budget, progress, fewest
         self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.outlook, self.before = Outlook(), 0.0  # before: seconds that were spent when it began
@@ -235,7 +235,7 @@ class _Search:
             self.start = min(found, key=lambda name: _rank(found[name]))
         v = self.barrier.entries.pack(*starts[self.start])
         P, _ = self._keep(v)
-        if self.least and P is not None:
+        if self.fewest and P is not None:
             self._lengthen(v, P)
         x = self.follow(v, weights)
         if x is not None:
@@ -313,6 +313,7 @@ class _Search:
 
     def _follow(self, mu: float, x: Array) -> bfgs.Point:
         """The minimum of J, only as exactly as the next mu needs it."""
+        number = _WEIGHTS.index(mu)
 
         def advance(x: Array) -> None:
             if self.best is None or x[-1] < self.best[-1]:
@@ -320,12 +321,11 @@ class _Search:
             if self.progress is not None:
                 gamma, spent, horizon = math.exp(x[-1] / 2.0), self.budget.spent, self.barrier.horizon
                 at = Progress(self.start, mu, self.steps, gamma, spent, horizon, whole=self._whole(spent))
-                self.progress(at._replace(round=round + 1, rounds=len(_WEIGHTS)))
+                self.progress(at._replace(round=number + 1, rounds=len(_WEIGHTS)))
 
-        round = _WEIGHTS.index(mu)
         # L-BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
         inverse_hessian = self.barrier.inverse_hessian(x, mu)
-        return self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, round=round, enough=0.3 * mu)
+        return self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, number, enough=0.3 * mu)
 
     def _whole(self, spent: float) -> float:
         """Seconds of everything, by what the evaluations so far have taken."""
@@ -338,7 +338,7 @@ class _Search:
         ridge = _RIDGE / float(v @ v)
         inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)
         J, advance = self.barrier.centre(y, ridge), self.centred.append
-        self._minimise(J, v, inverse_hessian, advance, round=len(_WEIGHTS), enough=1e-2)
+        self._minimise(J, v, inverse_hessian, advance, len(_WEIGHTS), enough=1e-2)
 
     def _minimise(
         self,
@@ -346,20 +346,20 @@ class _Search:
         x: Array,
         inverse_hessian: bfgs.Map,
         advance: Callable[[Array], None],
+        number: int,
         *,
-        round: int,
         enough: float,
     ) -> bfgs.Point:
-        """L-BFGS within the budget, its steps and evaluations counted."""
-        self.outlook.begin(round, enough)
+        """L-BFGS within the budget, its steps and evaluations counted as those of a round, from 0."""
+        self.outlook.begin(number, enough)
 
         def evaluated(x: Array) -> tuple[float, Array]:
-            begun = self.budget.spent if self.least else 0.0
+            begun = self.budget.spent if self.fewest else 0.0
             found = function(x)
             self.outlook.evaluated(self.barrier.horizon)
-            if self.least:
-                self.budget.check(self.least * (self.budget.spent - begun))
-                self.least = 0
+            if self.fewest:
+                self.budget.check(self.fewest * (self.budget.spent - begun))
+                self.fewest = 0
             return found
 
         def counted(point: bfgs.Point) -> None:

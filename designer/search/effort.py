@@ -139,4 +139,3 @@ def in_words(seconds: float) -> str:
 def _numbers(problem: Problem, n: int) -> float:
     """Of Y_bar of n nodes: modes n_eta^2."""
     return float(len(problem.topologies) * (problem.plant_states + n * problem.nx) ** 2)
-

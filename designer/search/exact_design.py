@@ -39,7 +39,7 @@ _FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if n
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
-_LEAST = 100  # evaluations of the whole after windows: with less, all may be for nothing
+_FEWEST = 100  # evaluations of the whole after windows: with less, all may be for nothing
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -162,7 +162,7 @@ def _by_windows(
         first=WEIGHT_OF_WINDOWS,
         budget=Budget(0.0) if ended else budget,
         progress=progress,
-        least=_LEAST,
+        fewest=_FEWEST,
     )
     return descent._replace(ended=ended) if ended else descent
 

@@ -48,7 +48,7 @@ def _of_groups(root: Path) -> float:
     if own is None:
         return math.inf
     top = root / "sys/fs/cgroup"
-    return min(_of_group(top / path) for path in (own, *Path(own).parents))
+    return min(_of_group(top / path) for path in (Path(own), *Path(own).parents))
 
 
 def _of_group(group: Path) -> float:

@@ -1,4 +1,4 @@
-"""What is left of a descent while it goes on, from the evaluations of its rounds so far and from how fast the last fell.
+"""What is left of a descent, from the evaluations of its rounds so far and from how fast its last steps fell.
 
 It is counted in steps of the recursion, of which an evaluation over T steps takes T; a clock makes seconds of them. How
 long the horizon will be is not known beforehand, so what is said holds for the T of now.
@@ -26,10 +26,10 @@ class Outlook:
         self._values: list[float] = []
         self.steps = 0  # of the recursion, in all
 
-    def begin(self, round: int, enough: float) -> None:
+    def begin(self, number: int, enough: float) -> None:
         """Of `bfgs.minimise`, which ends when ten steps gain less than `enough`."""
-        self._round, self._enough, self._values = round, enough, []
-        self._taken[round] = 0
+        self._round, self._enough, self._values = number, enough, []
+        self._taken[number] = 0
 
     def evaluated(self, horizon: int) -> None:
         """Once over so many steps."""

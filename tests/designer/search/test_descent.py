@@ -19,7 +19,7 @@ from networks import random_gains, random_problem, real_network, real_networks
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from benchmarks.design import NETWORKS, banded
-from designer.gain.exact import exact_gain
+from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.gain.floor import floor
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
@@ -28,7 +28,7 @@ from designer.search import descent
 from designer.search.barrier import Barrier
 from designer.search.descent import Budget, Descent, Progress, TimeIsUp, descend, to_its_end
 from designer.search.effort import gradients_of_exact, seconds_of_exact, seconds_within
-from designer.search.starts import consensus_gains, least_variance_gains
+from designer.search.starts import consensus_gains, ignoring, least_variance_gains
 
 
 class Counted(NamedTuple):
@@ -213,6 +213,55 @@ def test_what_there_is_is_kept_when_time_is_over(evaluations: int) -> None:
     assert before.stable
     assert (found.steps == 0) == (evaluations < 2)
     assert found.chosen.gain.high < 0.9 * before.high if found.steps else found.chosen.gain.high == before.high
+
+
+@pytest.fixture(scope="module")
+def slow() -> tuple[Problem, StackedGains]:
+    """A plant whose errors last for a hundred steps, and a start that decays as slowly."""
+    problem = real_network(find("two-nodes"), radius=0.99)
+    return problem, ignoring(problem)
+
+
+def test_a_search_from_nearby_looks_as_far_as_the_start_needs(slow: tuple[Problem, StackedGains]) -> None:
+    """To a twentieth of its exact gain."""
+    model, told = error_model(slow[0], *slow[1]), []
+
+    def tell(progress: Progress) -> None:
+        told.append(progress.horizon)
+        raise KeyboardInterrupt
+
+    search = descent._Search(slow[0], Budget(), tell, fewest=1)
+    with pytest.raises(KeyboardInterrupt):
+        search.run({"near": slow[1]}, (descent.NEAR,))
+    nearly = (exact_gain(model).high / 1.06) ** 2
+    assert horizon_gain(Operator(model), told[0])[0] > nearly > horizon_gain(Operator(model), told[0] // 4)[1]
+
+
+def test_a_search_that_sees_nothing_of_a_slow_decay_is_not_tried(
+    slow: tuple[Problem, StackedGains], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descent, "_LONGEST", 20)
+    found = descend(slow[0], {"near": slow[1]}, fewest=1)
+    assert (found.ended, found.steps) == ("errors decay too slowly for a search over 20 steps", 0)
+    assert np.array_equal(found.chosen.H_bar, slow[1][1])
+
+
+@pytest.mark.parametrize(("fewest", "steps"), [(30, 0), (10, 1)])
+def test_a_search_that_comes_to_nothing_in_its_time_is_not_tried(fewest: int, steps: int) -> None:
+    """By a clock that knows evaluations alone, of which there is time for twenty, and for a step."""
+    problem, asked = find("two-nodes"), []
+    swept = Barrier._swept
+
+    def counting(barrier: Barrier, *rest: Any, **more: Any) -> Any:
+        asked.append(1.0)
+        return swept(barrier, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Barrier, "_swept", counting)
+        budget = Budget(20.0, clock=lambda: sum(asked))
+        found = descend(problem, {"near": least_variance_gains(problem)}, budget=budget, fewest=fewest)
+    assert found.ended == "out of time"
+    assert (found.steps > 0) == (steps > 0)
 
 
 def test_a_second_thought_while_the_choice_is_made_does_not_lose_it(monkeypatch: pytest.MonkeyPatch) -> None:
