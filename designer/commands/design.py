@@ -244,7 +244,8 @@ def _chosen_method(problem: Problem, budget: float | None) -> str:
     least, usual, most = seconds_within(problem, default_budget(problem) if budget is None else budget)
     if min(usual, most) > LONG:
         rule = f", about {in_words(usual)} as a rule" if least < usual < most else ""
-        at_least, memory = f"{in_words(least)} to " if least < most else "", bytes_of_exact(problem)
+        memory, (number, unit) = bytes_of_exact(problem), in_words(least).split()
+        at_least = f"{number if in_words(most).endswith(unit) else in_words(least)} to " if least < most else ""
         large = f"; up to {memory / 1e9:.1f} GB of memory" if memory > LARGE else ""
         print(
             f"method exact: it takes {at_least}{in_words(most)} here{rule}, the longer the more slowly errors turn out "

@@ -221,7 +221,7 @@ class _Search:
         self.problem, self.budget, self.progress, self.fewest = problem, budget, progress, fewest
         self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
-        self.outlook, self.before = Outlook(), 0.0  # before: seconds that were spent when it began
+        self.outlook, self.before = Outlook(problem.n), 0.0  # before: seconds that were spent when it began
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
         self.centred: list[Array] = []  # v of ever smaller gains

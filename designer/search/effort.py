@@ -8,13 +8,13 @@ has what was measured.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.search.descent import longest_horizon
 from designer.search.memory import free_memory
+from designer.search.outlook import growth
 from designer.search.windows import windows
 
 MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
@@ -27,7 +27,6 @@ BUDGET_WHERE_SLOW, SLOW, FEW_STATES = (
 LONG, LARGE = 60.0, 5e8  # seconds and bytes, which are worth a word beforehand
 _GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
 _STEPS, _LEFT = 20, 2.0
-_GROWTH = 0.95  # of larger networks, by the nodes: more gains, and longer horizons
 _FEWEST, _MORE = 330, 3.0  # where errors decay soon, and at most so many times as many of larger networks
 _OF_A_WINDOW = 100  # gradients of one
 _OF_THE_REST = 60  # gradients of a network in windows: start, exact gain and proof
@@ -67,7 +66,7 @@ class Seconds(NamedTuple):
 def seconds_within(problem: Problem, budget: float) -> Seconds:
     """Estimated for a search that has so many seconds, of which a share is kept for the proof, at most half."""
     gradient, rest = _of_a_gradient(problem, problem.n), 0.0
-    least = _FEWEST * min(_growth(problem), _MORE) * _longer(problem) * gradient
+    least = _FEWEST * min(growth(problem.n), _MORE) * _longer(problem) * gradient
     if in_windows(problem):
         rest = _OF_THE_REST * gradient
         least = rest + sum(_OF_A_WINDOW * _of_a_gradient(problem, len(window.nodes)) for window in windows(problem))
@@ -82,11 +81,7 @@ def seconds_of_exact(problem: Problem) -> float:
 
 def gradients_of_exact(problem: Problem) -> float:
     """Estimated number of gradients over 20 steps, as a rule; one over 40 counts twice."""
-    return _GRADIENTS * _growth(problem) * _longer(problem)
-
-
-def _growth(problem: Problem) -> float:
-    return math.pow(max(problem.n / 6.0, 1.0), _GROWTH)
+    return _GRADIENTS * growth(problem.n) * _longer(problem)
 
 
 def _of_a_gradient(problem: Problem, n: int) -> float:

@@ -10,17 +10,24 @@ import math
 
 from designer.search.bfgs import PATIENCE
 
-_USUAL = (22, 27, 34, 50, 60, 85, 80, 120)  # evaluations of each round, of small networks
-_USUAL_OF_CENTRE = 110
-_FIRM = 400.0  # evaluations that count as much as what is usual
+_USUAL = (22, 27, 34, 50, 62, 95, 90, 150)  # evaluations of each round, of networks with few nodes
+_USUAL_OF_CENTRE = 120
+_FEW, _GROWTH, _MORE = 6, 0.95, 2.0  # nodes; with more, more evaluations, at most so many times as many
+_FIRM = 700.0  # evaluations that count as much as what is usual
 _A_STEP = 1.4  # evaluations
 
 
-class Outlook:
-    """The rounds of one descent, the last of which is its centring."""
+def growth(nodes: int) -> float:
+    """How many times as long a search takes as one of few nodes, an evaluation as long."""
+    return math.pow(max(nodes / _FEW, 1.0), _GROWTH)
 
-    def __init__(self) -> None:
-        self._usual = (*_USUAL, _USUAL_OF_CENTRE)
+
+class Outlook:
+    """The rounds of one descent of a network of so many nodes; the last is its centring."""
+
+    def __init__(self, nodes: int) -> None:
+        more = min(growth(nodes), _MORE)
+        self._usual = tuple(more * evaluations for evaluations in (*_USUAL, _USUAL_OF_CENTRE))
         self._taken: dict[int, int] = {}  # evaluations of each round, the last time it was gone through
         self._round, self._enough = 0, 1.0
         self._values: list[float] = []
