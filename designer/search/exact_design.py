@@ -39,6 +39,7 @@ _FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if n
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
+_STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
 _FEWEST = 100  # evaluations of the whole after windows: with less, all may be for nothing
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
@@ -92,6 +93,7 @@ def design_exact(
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
     if own and in_windows(problem):
+        budget.keep(_STARTS_OF_THE_END * (begun - started))
         descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress, held=held)
