@@ -229,7 +229,7 @@ class _Search:
     # the way down
     def run(self, starts: Mapping[str, StackedGains], weights: tuple[float, ...]) -> None:
         """The best start by these weights, on longer horizons while T is too short; then to the centre."""
-        self.start, self.before = next(iter(starts)), self.budget.spent
+        self.start = next(iter(starts))
         if len(starts) > 1:
             found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
             self.start = min(found, key=lambda name: _rank(found[name]))
@@ -237,6 +237,7 @@ class _Search:
         P, _ = self._keep(v)
         if self.fewest and P is not None:
             self._lengthen(v, P)
+        self.before = self.budget.spent
         x = self.follow(v, weights)
         if x is not None:
             self._centre(x)
