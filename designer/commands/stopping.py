@@ -9,7 +9,7 @@ from types import FrameType
 
 from agent.signals import heed, restore
 
-STOPPING = "stopping: the best gains so far are chosen and certified, which takes some seconds"
+STOPPING = "stopping: the best gains so far are chosen and certified, which takes seconds, of large networks minutes"
 STOPPED = "still at it: the search is over, and the gains are written as soon as they are certified"
 
 
