@@ -124,6 +124,10 @@ class Budget:
     def spent(self) -> float:
         return self._clock() - self._begun
 
+    def end(self) -> None:
+        """No more time for a search."""
+        self.seconds = 0.0
+
     def keep(self, seconds: float) -> None:
         """So much for what comes after the search, but no more than half of all."""
         self.kept = max(self.kept, min(seconds, self.seconds / 2.0))

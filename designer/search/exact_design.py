@@ -108,7 +108,8 @@ def design_exact(
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
         pressed = descent.ended == "interrupted"
-        budget = Budget(0.0) if pressed else budget
+        if pressed:
+            budget.end()
         found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress, held=held)
         found = found._replace(ended=descent.ended) if pressed else found
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
@@ -158,14 +159,10 @@ def _by_windows(
 
     windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
-    descent = descend(
-        problem,
-        {"windows": windowed.gains},
-        first=WEIGHT_OF_WINDOWS,
-        budget=Budget(0.0) if ended else budget,
-        progress=progress,
-        fewest=_FEWEST,
-    )
+    if ended:
+        budget.end()
+    start = {"windows": windowed.gains}
+    descent = descend(problem, start, first=WEIGHT_OF_WINDOWS, budget=budget, progress=progress, fewest=_FEWEST)
     return descent._replace(ended=ended) if ended else descent
 
 
