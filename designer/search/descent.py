@@ -44,8 +44,8 @@ _COARSE = 1e-3  # of gamma^2, where starts are compared
 _NEARLY = 1.05  # times gamma_T may be the exact gain of gains that a search starts near
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
-_SWEEPS_OF_THE_END = 100  # of the recursion: two exact gains, and a proof
-_DECAYS_OF_THE_END = 10  # as long as it takes, if not longer, to see that errors decay
+_SWEEPS_OF_THE_END = 40  # of the recursion: two exact gains, and a proof
+_DECAYS_OF_THE_END = 10  # and as often it is seen that errors decay, or as long as that takes
 _NOTHING = 1e-200  # gamma^2 below this is 0
 _VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
@@ -226,6 +226,7 @@ class _Search:
         self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
         self.outlook, self.before = Outlook(problem.n), 0.0  # before: seconds that were spent when it began
+        self.sweep = self.decay = 0.0  # the most seconds that one has taken
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
         self.centred: list[Array] = []  # v of ever smaller gains
@@ -272,10 +273,15 @@ class _Search:
         """What `lyapunov` says of gains, which are kept if they are mean-square stable."""
         begun = self.budget.spent
         P, decays = lyapunov(self.barrier.operator(v))
-        self.budget.keep(_DECAYS_OF_THE_END * (self.budget.spent - begun))
+        self.decay = max(self.decay, self.budget.spent - begun)
+        self._keep_time()
         if P is not None:
             self.stable.append(_Stable(v, P, decays))
         return P, decays
+
+    def _keep_time(self) -> None:
+        """For the choice and the proof."""
+        self.budget.keep(_SWEEPS_OF_THE_END * self.sweep + _DECAYS_OF_THE_END * self.decay)
 
     def _lengthen(self, v: Array, P: Array) -> None:
         """To a horizon over which these gains show nearly all of their exact gain."""
@@ -298,7 +304,8 @@ class _Search:
         begun = self.budget.spent
         g, invariant = above**2 * math.exp(x[-1]), InvariantSet(P)
         trial = recursion_holds(operator, g, _LONG, invariant=invariant, look=self.budget.check)
-        self.budget.keep(_SWEEPS_OF_THE_END * (self.budget.spent - begun))
+        self.sweep = max(self.sweep, self.budget.spent - begun)
+        self._keep_time()
         return trial.holds is False and self._may_be_longer()
 
     def _begin(self, v: Array) -> Array:
