@@ -64,13 +64,16 @@ class Seconds(NamedTuple):
 
 
 def seconds_within(problem: Problem, budget: float) -> Seconds:
-    """Estimated for a search that has so many seconds, of which a share is kept for the proof, at most half."""
+    """Estimated for a search that has so many seconds, of which a share is kept for the proof, at most half.
+
+    But windows may take them all.
+    """
     gradient, rest = _of_a_gradient(problem, problem.n), 0.0
     least = _FEWEST * min(growth(problem.n), _MORE) * _longer(problem) * gradient
     if in_windows(problem):
         rest = _OF_THE_REST * gradient
         least = rest + sum(_OF_A_WINDOW * _of_a_gradient(problem, len(window.nodes)) for window in windows(problem))
-    most = max(budget, budget / 2.0 + rest)
+    most = budget if budget >= 2.0 * rest else budget + rest
     return Seconds(min(least, most), seconds_of_exact(problem), most)
 
 

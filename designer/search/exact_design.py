@@ -93,8 +93,8 @@ def design_exact(
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
     if own and in_windows(problem):
-        budget.keep(_STARTS_OF_THE_END * (begun - started))
-        descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
+        after = _STARTS_OF_THE_END * (begun - started)
+        descent = _by_windows(problem, starts, after, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress, held=held)
     descent = descent._replace(ended="interrupted") if stopped else descent
@@ -145,12 +145,16 @@ def design_exact(
 def _by_windows(
     problem: Problem,
     starts: Mapping[str, StackedGains],
+    after: float,
     *,
     budget: Budget,
     progress: Callable[[Progress], None] | None,
     dask: str | None,
 ) -> Descent:
-    """Windows first, from which the whole network's search goes on where there are time and memory for it."""
+    """Windows first, from which the whole network's search goes on where there are time and memory for it.
+
+    `after`: the seconds that choice and proof will take. Windows may take these too: they are worth the most.
+    """
 
     def report(done: int, of: int) -> None:
         if progress is not None:
@@ -158,6 +162,7 @@ def _by_windows(
             progress(Progress("", WEIGHT_OF_WINDOWS, 0, math.inf, budget.spent, 0, phase=phase))
 
     windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
+    budget.keep(after)
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
     if ended:
         budget.end()

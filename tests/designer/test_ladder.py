@@ -169,7 +169,7 @@ def test_the_estimate_grows_with_the_cube_of_large_networks_and_the_least_with_t
 
 @pytest.mark.parametrize("budget", [60.0, 600.0])
 def test_a_budget_ends_the_search_and_leaves_time_for_the_proof(budget: float) -> None:
-    """Half of it at least is searched for, so what is proved of 500 nodes may take longer than a minute."""
+    """Windows may take all of it, and so what is proved of 500 nodes makes a minute longer."""
     small, large = (seconds_within(banded(n), budget) for n in (100, 500))
     assert small.most == budget
     assert large.least <= large.most
