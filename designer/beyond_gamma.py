@@ -20,6 +20,7 @@ from designer.start import FromStart, from_start
 from designer.start import told as from_there
 
 _MOST_STATES = 40  # n nx up to which the gain of each node is worth its time
+_MOST_OF_NOISE = 500  # n nx up to which the noise is worth its time, and the memory that its equation takes
 _FEW = 8  # nodes that get a line each; of more, as many
 
 
@@ -54,18 +55,19 @@ class BeyondGamma(NamedTuple):
 def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | None = None) -> BeyondGamma:
     """For any gains, with the P that their certificate stores; nothing where they are not mean-square stable."""
     model = model_of_gains(problem, K, H)
-    noise = steady_state(model, initial=problem.mode_index(problem.markov.initial))
-    small = problem.n * problem.nx <= _MOST_STATES
-    return BeyondGamma(
-        problem.node_names, problem.weights, noise, node_gains(model) if small else None, from_start(problem, K, H, P)
-    )
+    initial, states = problem.mode_index(problem.markov.initial), problem.n * problem.nx
+    noise = steady_state(model, initial=initial) if states <= _MOST_OF_NOISE else None
+    gains = node_gains(model) if states <= _MOST_STATES else None
+    return BeyondGamma(problem.node_names, problem.weights, noise, gains, from_start(problem, K, H, P))
 
 
 def told(facts: dict[str, Any]) -> list[str]:
     """`BeyondGamma.document` for people: the noise, then a line for each node, of many for those that have most."""
     noise, gains = facts["white_noise"], facts["node_gains"] or {}
     if noise is None:
-        return ["noise      what white w leaves in the steady state was not found", *from_there(facts.get("start"))]
+        never = f"; of more than {_MOST_OF_NOISE} states n nx it is not sought"
+        not_found = f"noise      what white w leaves in the steady state was not found{never}"
+        return [not_found, *from_there(facts.get("start"))]
     found = [f"noise      E|z~|^2 = {noise['mean_square']:.6g} in the steady state under white w of unit covariance"]
     order = sorted(noise["nodes"], key=lambda name: -noise["nodes"][name])
     names = list(noise["nodes"]) if len(order) <= _FEW else order[:_FEW]

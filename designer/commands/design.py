@@ -169,11 +169,13 @@ def design_and_save(
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
     with stoppable() as search:
-        tell = _descent_progress(budget)
+        tell = _descent_progress(budget, alone=box is None and not peak_slack)
 
         def progress(at: Progress) -> None:
             search.over |= at.over and box is None  # else the search on the worst models follows
             tell(at)
+            if at.mu > 0.0:  # neither choice nor proof
+                search.stepped()
 
         how: dict[str, Any] = {"method": method, "budget": budget, "dask": dask, "peak_slack": peak_slack}
         how["progress"] = progress
@@ -220,22 +222,34 @@ def _refuse_nothing_to_spread(problem: Problem, method: str) -> None:
 
 def _chosen_method(problem: Problem, budget: float | None) -> str:
     """The default for this problem; on stderr why, where it is not the best one or takes long."""
-    from designer.search.effort import LONG, MOST_NODES, default_budget, default_method, in_words, seconds_of_exact
+    from designer.search.effort import (
+        LARGE,
+        LONG,
+        MOST_NODES,
+        bytes_of_exact,
+        default_budget,
+        default_method,
+        in_words,
+        seconds_within,
+    )
 
-    method, seconds = default_method(problem), seconds_of_exact(problem)
-    budget = default_budget(problem) if budget is None else budget
+    method = default_method(problem)
     if method != "exact":
         print(
             f"method {method}: of more than {MOST_NODES} nodes some hear too many others to be searched in windows; "
             "--method exact asks for a search of all at once",
             file=sys.stderr,
         )
-    elif min(seconds, budget) > LONG:
-        so_far = f" of about {in_words(seconds)}" if seconds > budget else ""
-        slower = "" if seconds > budget else f", or up to {in_words(budget)} where errors turn out to decay slowly"
+        return method
+    least, usual, most = seconds_within(problem, default_budget(problem) if budget is None else budget)
+    if min(usual, most) > LONG:
+        rule = f", about {in_words(usual)} as a rule" if least < usual < most else ""
+        memory, (number, unit) = bytes_of_exact(problem), in_words(least).split()
+        at_least = f"{number if in_words(most).endswith(unit) else in_words(least)} to " if least < most else ""
+        large = f"; up to {memory / 1e9:.1f} GB of memory" if memory > LARGE else ""
         print(
-            f"method exact: it takes about {in_words(min(seconds, budget))}{so_far} here{slower}; --budget 1min less, "
-            "and --method decomposed is faster",
+            f"method exact: it takes {at_least}{in_words(most)} here{rule}, the longer the more slowly errors turn out "
+            f"to decay{large}; --budget 1min less, and --method decomposed is faster",
             file=sys.stderr,
         )
     return method
@@ -270,8 +284,11 @@ def design_text(result: dict[str, Any]) -> str:
     )
 
 
-def _descent_progress(budget: float) -> Callable[[Progress], None]:
-    """Prints every other second how much of the descent is done and what is in hand, and what comes after it."""
+def _descent_progress(budget: float, *, alone: bool = True) -> Callable[[Progress], None]:
+    """Prints every other second how much of the descent is done and what is in hand, and what comes after it.
+
+    `alone`: no other search follows.
+    """
     from designer.search.effort import in_words
 
     shown = 0.0
@@ -291,7 +308,10 @@ def _descent_progress(budget: float) -> Callable[[Progress], None]:
                 else f"{counted(progress.steps, 'change')} on: noise over {progress.horizon} steps < "
                 f"{progress.noise:.6g}, gamma < {progress.gamma:.6g}"
             )
-            done = f"{progress.seconds:5.0f} s of {in_words(budget)} at most"
+            about = ""
+            if alone and progress.whole < budget:
+                about = f"about {in_words(progress.whole)} if {progress.horizon} steps are enough, "
+            done = f"{progress.seconds:5.0f} s of {about}{in_words(budget)} at most"
             rounds = f", round {progress.round} of {progress.rounds}" if progress.rounds else ""
             print(f"{done}{rounds}, {so_far}; Ctrl-C keeps the best so far", file=sys.stderr)
 

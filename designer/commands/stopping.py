@@ -9,7 +9,7 @@ from types import FrameType
 
 from agent.signals import heed, restore
 
-STOPPING = "stopping: the best gains so far are chosen and certified, which takes some seconds"
+STOPPING = "stopping: the best gains so far are chosen and certified, which takes seconds, of large networks minutes"
 STOPPED = "still at it: the search is over, and the gains are written as soon as they are certified"
 
 
@@ -17,6 +17,12 @@ class Search:
     """What signals may end."""
 
     over = False  # all that is left is to be written
+    asked = False  # a signal has come
+
+    def stepped(self) -> None:
+        """A search goes on: KeyboardInterrupt where a signal came whose own was lost, in a callback of a library."""
+        if self.asked:
+            raise KeyboardInterrupt
 
 
 @contextmanager
@@ -27,7 +33,7 @@ def stoppable() -> Iterator[Search]:
     def stop(number: int, frame: FrameType | None) -> None:
         print(STOPPED if search.over else STOPPING, file=sys.stderr, flush=True)
         if not search.over:
-            search.over = True
+            search.over = search.asked = True
             raise KeyboardInterrupt
 
     handlers = heed(stop)

@@ -9,6 +9,7 @@ In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.j
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -241,11 +242,18 @@ class Trial(NamedTuple):
     steps: int
 
 
-def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: InvariantSet | None = None) -> Trial:
+def recursion_holds(
+    operator: Operator,
+    g: float,
+    horizon: int,
+    *,
+    invariant: InvariantSet | None = None,
+    look: Callable[[], None] = lambda: None,
+) -> Trial:
     """Whether gamma_T^2 <= g, T = horizon: whether every W is positive definite.
 
     With an invariant set the question is whether gamma^2 <= g; it is looked for every now and then, so that looking
-    takes a sixteenth more steps, not as long as they.
+    takes a sixteenth more steps, not as long as they; `look` is called as often.
     """
     Y, measure, next_look = operator.MM, 0.0, 1
     for steps in range(1, horizon + 1):
@@ -254,6 +262,7 @@ def recursion_holds(operator: Operator, g: float, horizon: int, *, invariant: In
             return Trial(False, -math.inf, steps)
         Y, measure = taken.Y, measure + float(taken.log_det.min())
         if invariant is not None and steps >= next_look:
+            look()
             if invariant.contains(Y, g):
                 return Trial(True, measure, steps)
             if invariant.never_reached(Y, g):

@@ -19,7 +19,7 @@ Function = Callable[[Array], tuple[float, Array]]  # value and gradient
 Map = Callable[[Array], Array]  # a symmetric positive matrix times a vector
 
 _PAIRS = 100
-_PATIENCE = 10
+PATIENCE = 10
 _MOST_STEPS = 300
 
 
@@ -59,7 +59,7 @@ def minimise(function: Function, x: Array, first: Map, advance: Callable[[Point]
         point = following
         values.append(point.value)
         advance(point)
-        if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < enough:
+        if len(values) > PATIENCE and values[-1 - PATIENCE] - values[-1] < enough:
             break
     return point
 

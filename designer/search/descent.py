@@ -28,6 +28,7 @@ from designer.gain.exact import Gain, InvariantSet, exact_gain, horizon_gain, ly
 from designer.model.error_model import StackedGains, error_model
 from designer.search import bfgs
 from designer.search.barrier import Barrier
+from designer.search.outlook import Outlook
 
 Made = TypeVar("Made")
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
@@ -40,9 +41,11 @@ _NUMBERS = 2e8  # that the Y_bar of all steps may be: 1.6 GB
 _SHORT = 1e-4  # gamma may exceed sqrt(g) by so much of itself, or by this part of mu, before T is doubled
 _SHORT_OF_MU = 0.3
 _COARSE = 1e-3  # of gamma^2, where starts are compared
+_NEARLY = 1.05  # times gamma_T may be the exact gain of gains that a search starts near
 _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _SWEEPS_OF_THE_END = 40  # of the recursion: two exact gains, and a proof
+_DECAYS_OF_THE_END = 10  # and as often it is seen that errors decay, or as long as that takes
 _NOTHING = 1e-200  # gamma^2 below this is 0
 _VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
@@ -61,6 +64,7 @@ class Progress(NamedTuple):
     over: bool = False  # no search comes after it
     round: int = 1  # of `rounds`, one for each mu; some are gone through again over a longer horizon
     rounds: int = 0  # 0: not told
+    whole: float = math.inf  # seconds that all will have taken if T stays; infinite: not told
 
 
 class Candidate(NamedTuple):
@@ -107,7 +111,7 @@ class Descent(NamedTuple):
     least: Candidate
     start: str
     steps: int
-    ended: str  # "converged", "interrupted" or "out of time"
+    ended: str  # "converged", "interrupted", "out of time", or why there was no search
 
 
 class Budget:
@@ -120,13 +124,17 @@ class Budget:
     def spent(self) -> float:
         return self._clock() - self._begun
 
+    def end(self) -> None:
+        """No more time for a search."""
+        self.seconds = 0.0
+
     def keep(self, seconds: float) -> None:
         """So much for what comes after the search, but no more than half of all."""
         self.kept = max(self.kept, min(seconds, self.seconds / 2.0))
 
-    def check(self) -> None:
-        """TimeIsUp where it is."""
-        if self.spent >= self.seconds - self.kept:
+    def check(self, ahead: float = 0.0) -> None:
+        """TimeIsUp where it is, or will be in so many seconds."""
+        if self.spent + ahead >= self.seconds - self.kept:
             raise TimeIsUp
 
     def watched(self, function: bfgs.Function) -> bfgs.Function:
@@ -151,6 +159,10 @@ class TimeIsUp(Exception):
     """Ends the search, as Ctrl-C does."""
 
 
+class TooSlow(Exception):
+    """Ends a search that does not see as far as errors last."""
+
+
 def longest_horizon(problem: Problem) -> int:
     """The most steps that the search looks over, whether it comes to that or not."""
     numbers, horizon = len(problem.topologies) * (problem.plant_states + problem.n * problem.nx) ** 2, _HORIZON
@@ -167,15 +179,17 @@ def descend(
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     held: NDArray[np.bool_] | None = None,
+    fewest: int = 0,
 ) -> Descent:
     """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
 
     `held`: as `Entries` takes it.
 
     KeyboardInterrupt ends the search, not the program, and so does the end of the budget: the best gains so far are
-    returned.
+    returned. Where `fewest` is not 0 the start is near what is sought: there is no search without time for so many
+    evaluations, by what the first one takes, nor over a horizon that shows nothing of the start's exact gain.
     """
-    search = _Search(problem, Budget() if budget is None else budget, progress, held)
+    search = _Search(problem, Budget() if budget is None else budget, progress, held, fewest)
     ended = "converged"
     try:
         search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
@@ -183,6 +197,8 @@ def descend(
         ended = "interrupted"
     except TimeIsUp:
         ended = "out of time"
+    except TooSlow:
+        ended = f"errors decay too slowly for a search over {search.longest} steps"
     least, chosen = to_its_end(lambda: search.choose(starts))
     search.refuse_nothing(least.gain.high**2)
     return Descent(chosen, least, search.start, search.steps, ended)
@@ -204,10 +220,13 @@ class _Search:
         budget: Budget,
         progress: Callable[[Progress], None] | None,
         held: NDArray[np.bool_] | None = None,
+        fewest: int = 0,
     ) -> None:
-        self.problem, self.budget, self.progress = problem, budget, progress
+        self.problem, self.budget, self.progress, self.fewest = problem, budget, progress, fewest
         self.barrier, self.longest = Barrier(problem, _HORIZON, held=held), longest_horizon(problem)
         self.start, self.steps, self.first = "", 0, 0.0  # first: gamma^2 of the start
+        self.outlook, self.before = Outlook(problem.n), 0.0  # before: seconds that were spent when it began
+        self.sweep = self.decay = 0.0  # the most seconds that one has taken
         self.best: Array | None = None  # [v; y] with the least y so far on this horizon
         self.stable: list[_Stable] = []  # the start and where the weights led to, as far as mean-square stable
         self.centred: list[Array] = []  # v of ever smaller gains
@@ -220,7 +239,10 @@ class _Search:
             found = {name: exact_gain(error_model(self.problem, *at), width=_COARSE) for name, at in starts.items()}
             self.start = min(found, key=lambda name: _rank(found[name]))
         v = self.barrier.entries.pack(*starts[self.start])
-        self._keep(v)
+        P, _ = self._keep(v)
+        if self.fewest and P is not None:
+            self._lengthen(v, P)
+        self.before = self.budget.spent
         x = self.follow(v, weights)
         if x is not None:
             self._centre(x)
@@ -249,10 +271,29 @@ class _Search:
 
     def _keep(self, v: Array) -> tuple[Array | None, Decay]:
         """What `lyapunov` says of gains, which are kept if they are mean-square stable."""
+        begun = self.budget.spent
         P, decays = lyapunov(self.barrier.operator(v))
+        self.decay = max(self.decay, self.budget.spent - begun)
+        self._keep_time()
         if P is not None:
             self.stable.append(_Stable(v, P, decays))
         return P, decays
+
+    def _keep_time(self) -> None:
+        """For the choice and the proof."""
+        self.budget.keep(_SWEEPS_OF_THE_END * self.sweep + _DECAYS_OF_THE_END * self.decay)
+
+    def _lengthen(self, v: Array, P: Array) -> None:
+        """To a horizon over which these gains show nearly all of their exact gain."""
+        operator, invariant = self.barrier.operator(v), InvariantSet(P)
+        while True:
+            self.budget.check()
+            g = horizon_gain(operator, self.barrier.horizon, width=_NEARLY - 1.0)[1] * _NEARLY**2
+            if recursion_holds(operator, g, _LONG, invariant=invariant, look=self.budget.check).holds:
+                return
+            if not self._may_be_longer():
+                raise TooSlow
+            self.barrier.horizon *= 2
 
     def _may_be_longer(self) -> bool:
         return 2 * self.barrier.horizon <= self.longest
@@ -261,8 +302,10 @@ class _Search:
         """Whether the exact gain of these gains is above sqrt(g)."""
         operator, above = self.barrier.operator(x[:-1]), 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
         begun = self.budget.spent
-        trial = recursion_holds(operator, above**2 * math.exp(x[-1]), _LONG, invariant=InvariantSet(P))
-        self.budget.keep(_SWEEPS_OF_THE_END * (self.budget.spent - begun))
+        g, invariant = above**2 * math.exp(x[-1]), InvariantSet(P)
+        trial = recursion_holds(operator, g, _LONG, invariant=invariant, look=self.budget.check)
+        self.sweep = max(self.sweep, self.budget.spent - begun)
+        self._keep_time()
         return trial.holds is False and self._may_be_longer()
 
     def _begin(self, v: Array) -> Array:
@@ -282,25 +325,32 @@ class _Search:
 
     def _follow(self, mu: float, x: Array) -> bfgs.Point:
         """The minimum of J, only as exactly as the next mu needs it."""
+        number = _WEIGHTS.index(mu)
 
         def advance(x: Array) -> None:
             if self.best is None or x[-1] < self.best[-1]:
                 self.best = x
             if self.progress is not None:
-                gamma, horizon = math.exp(x[-1] / 2.0), self.barrier.horizon
-                at = Progress(self.start, mu, self.steps, gamma, self.budget.spent, horizon)
-                self.progress(at._replace(round=_WEIGHTS.index(mu) + 1, rounds=len(_WEIGHTS)))
+                gamma, spent, horizon = math.exp(x[-1] / 2.0), self.budget.spent, self.barrier.horizon
+                at = Progress(self.start, mu, self.steps, gamma, spent, horizon, whole=self._whole(spent))
+                self.progress(at._replace(round=number + 1, rounds=len(_WEIGHTS)))
 
         # L-BFGS begins anew each time: a start far away leaves it an inverse Hessian that misleads
         inverse_hessian = self.barrier.inverse_hessian(x, mu)
-        return self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, enough=0.3 * mu)
+        return self._minimise(self.barrier.descent(mu), x, inverse_hessian, advance, number, enough=0.3 * mu)
+
+    def _whole(self, spent: float) -> float:
+        """Seconds of everything, by what the evaluations so far have taken."""
+        a_step = (spent - self.before) / self.outlook.steps
+        return spent + self.outlook.left * self.barrier.horizon * a_step + self.budget.kept
 
     def _centre(self, x: Array) -> None:
         """From the least gamma to smaller and faster gains, gamma held below _SLACK times the least."""
         v, y = x[:-1], float(x[-1]) + 2.0 * math.log(_SLACK)
         ridge = _RIDGE / float(v @ v)
         inverse_hessian = self.barrier.inverse_hessian(np.append(v, y), 1.0, ridge=ridge)
-        self._minimise(self.barrier.centre(y, ridge), v, inverse_hessian, self.centred.append, enough=1e-2)
+        J, advance = self.barrier.centre(y, ridge), self.centred.append
+        self._minimise(J, v, inverse_hessian, advance, len(_WEIGHTS), enough=1e-2)
 
     def _minimise(
         self,
@@ -308,16 +358,28 @@ class _Search:
         x: Array,
         inverse_hessian: bfgs.Map,
         advance: Callable[[Array], None],
+        number: int,
         *,
         enough: float,
     ) -> bfgs.Point:
-        """L-BFGS within the budget, its steps counted."""
+        """L-BFGS within the budget, its steps and evaluations counted as those of a round, from 0."""
+        self.outlook.begin(number, enough)
+
+        def evaluated(x: Array) -> tuple[float, Array]:
+            begun = self.budget.spent if self.fewest else 0.0
+            found = function(x)
+            self.outlook.evaluated(self.barrier.horizon)
+            if self.fewest:
+                self.budget.check(self.fewest * (self.budget.spent - begun))
+                self.fewest = 0
+            return found
 
         def counted(point: bfgs.Point) -> None:
             self.steps += 1
+            self.outlook.fell(point.value)
             advance(point.x)
 
-        return bfgs.minimise(self.budget.watched(function), x, inverse_hessian, counted, enough=enough)
+        return bfgs.minimise(self.budget.watched(evaluated), x, inverse_hessian, counted, enough=enough)
 
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:

@@ -1,19 +1,20 @@
 """What the search for the least exact gain takes, estimated before it begins: what the default method depends on.
 
 The time is that of many gradients, and a gradient costs a bit and, for large networks, what it takes to pass over
-Y_bar. How many it takes depends on more than can be known beforehand: docs/theory.md, section 6, says how far off the
-estimate was. It is of the whole search, whose end a budget may come before.
+Y_bar. How many it takes depends on more than can be known beforehand, above all on how slowly errors decay at the least
+gain: so beforehand there is a range, and while it goes on designer.search.outlook says more. docs/theory.md, section 6,
+has what was measured.
 """
 
 from __future__ import annotations
 
-import math
-import os
-from pathlib import Path
+from typing import NamedTuple
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.search.descent import longest_horizon
+from designer.search.memory import free_memory
+from designer.search.outlook import growth
 from designer.search.windows import windows
 
 MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
@@ -23,10 +24,12 @@ BUDGET_WHERE_SLOW, SLOW, FEW_STATES = (
     0.999,
     40,
 )  # seconds, from this radius, for so many n nx: the rest gains little
-LONG = 60.0  # worth a word beforehand
+LONG, LARGE = 60.0, 5e8  # seconds and bytes, which are worth a word beforehand
 _GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
 _STEPS, _LEFT = 20, 2.0
-_MORE = 2.65  # times as many of large networks
+_FEWEST, _MORE = 300, 3.0  # where errors decay soon, and at most so many times as many of larger networks
+_OF_A_WINDOW = 100  # gradients of one
+_OF_THE_REST = 60  # gradients of a network in windows: start, exact gain and proof
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
 _WORK = 50  # matrices as large as Y_bar that the search keeps beside those of the horizon
@@ -52,18 +55,41 @@ def in_windows(problem: Problem) -> bool:
     return problem.n > MOST_NODES and bool(windows(problem))
 
 
+class Seconds(NamedTuple):
+    """Of processor time that method "exact" takes, from `least` to `most`; without a budget `usual`, as a rule."""
+
+    least: float
+    usual: float
+    most: float
+
+
+def seconds_within(problem: Problem, budget: float) -> Seconds:
+    """Estimated for a search that has so many seconds, of which a share is kept for the proof, at most half.
+
+    But windows may take them all.
+    """
+    gradient, rest = _of_a_gradient(problem, problem.n), 0.0
+    least = _FEWEST * min(growth(problem.n), _MORE) * _longer(problem) * gradient
+    if in_windows(problem):
+        rest = _OF_THE_REST * gradient
+        least = rest + sum(_OF_A_WINDOW * _of_a_gradient(problem, len(window.nodes)) for window in windows(problem))
+    most = budget if budget >= 2.0 * rest else budget + rest
+    return Seconds(min(least, most), seconds_of_exact(problem), most)
+
+
 def seconds_of_exact(problem: Problem) -> float:
-    """Estimated processor time of method "exact" without a budget."""
-    return gradients_of_exact(problem) * (_OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem))
+    """Estimated processor time of method "exact" without a budget, as a rule."""
+    return gradients_of_exact(problem) * _of_a_gradient(problem, problem.n)
 
 
 def gradients_of_exact(problem: Problem) -> float:
-    """Estimated number of gradients over 20 steps; one over 40 counts twice.
+    """Estimated number of gradients over 20 steps, as a rule; one over 40 counts twice."""
+    return _GRADIENTS * growth(problem.n) * _longer(problem)
 
-    Counted, it was within a factor 2 in most networks, but 11 times too low in one of 12 nodes whose horizon had to be
-    lengthened to 320 steps: the problem does not tell beforehand that the least gains let errors decay slowly.
-    """
-    return _GRADIENTS * min(math.pow(max(problem.n / 6.0, 1.0), 1.4), _MORE) * _longer(problem)
+
+def _of_a_gradient(problem: Problem, n: int) -> float:
+    """Seconds, where n nodes are searched at once."""
+    return _OF_A_GRADIENT + _OF_A_NUMBER * _numbers(problem, n)
 
 
 def _longer(problem: Problem) -> float:
@@ -74,14 +100,21 @@ def _longer(problem: Problem) -> float:
 
 def whole_fits(problem: Problem, *, free: float | None = None) -> bool:
     """Whether there is memory to search the whole network at once; `free` in bytes, or as the system says."""
-    return _bytes_of_whole(problem) <= (_free_memory() if free is None else free)
+    return _bytes_of_whole(problem) <= (free_memory() if free is None else free)
+
+
+def bytes_of_exact(problem: Problem, *, free: float | None = None) -> float:
+    """The most memory that method "exact" takes, where so much is free; it has to do with no less than this."""
+    whole = _bytes_of_whole(problem)
+    if whole_fits(problem, free=free) or not in_windows(problem):
+        return whole
+    return min(whole, _OTHERS + 8.0 * _WORK_OF_WINDOWS * _numbers(problem, problem.n))
 
 
 def refuse_without_memory(problem: Problem, *, free: float | None = None) -> None:
     """InputError where the search needs more memory than is free; `free` in bytes, or as the system says."""
-    needed, free = _bytes_of_whole(problem), _free_memory() if free is None else free
-    if in_windows(problem):
-        needed = min(needed, _OTHERS + 8.0 * _WORK_OF_WINDOWS * _numbers(problem))
+    free = free_memory() if free is None else free
+    needed = bytes_of_exact(problem, free=free)
     if needed > free:
         raise InputError(
             f"{problem.name}: method exact needs about {needed / 1e9:.1f} GB of memory for {problem.n} nodes and "
@@ -90,7 +123,7 @@ def refuse_without_memory(problem: Problem, *, free: float | None = None) -> Non
 
 
 def _bytes_of_whole(problem: Problem) -> float:
-    return _OTHERS + 8.0 * (longest_horizon(problem) + _WORK) * _numbers(problem)
+    return _OTHERS + 8.0 * (longest_horizon(problem) + _WORK) * _numbers(problem, problem.n)
 
 
 def in_words(seconds: float) -> str:
@@ -101,15 +134,6 @@ def in_words(seconds: float) -> str:
     return f"{max(seconds, 2.0):.0f} seconds"
 
 
-def _numbers(problem: Problem) -> float:
-    """Of Y_bar: modes n_eta^2."""
-    return float(len(problem.topologies) * (problem.plant_states + problem.n * problem.nx) ** 2)
-
-
-def _free_memory() -> float:
-    """Bytes that programs may still take; where the system does not say, what is installed."""
-    try:
-        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
-        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+def _numbers(problem: Problem, n: int) -> float:
+    """Of Y_bar of n nodes: modes n_eta^2."""
+    return float(len(problem.topologies) * (problem.plant_states + n * problem.nx) ** 2)

@@ -39,6 +39,8 @@ _FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if n
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
+_STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
+_FEWEST = 100  # evaluations of the whole after windows: with less, all may be for nothing
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
@@ -91,7 +93,8 @@ def design_exact(
         lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
     begun = time.perf_counter()
     if own and in_windows(problem):
-        descent = _by_windows(problem, starts, budget=budget, progress=progress, dask=dask)
+        after = _STARTS_OF_THE_END * (begun - started)
+        descent = _by_windows(problem, starts, after, budget=budget, progress=progress, dask=dask)
     else:
         descent = descend(problem, starts, first=first, budget=budget, progress=progress, held=held)
     descent = descent._replace(ended="interrupted") if stopped else descent
@@ -104,7 +107,11 @@ def design_exact(
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
+        pressed = descent.ended == "interrupted"
+        if pressed:
+            budget.end()
         found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress, held=held)
+        found = found._replace(ended=descent.ended) if pressed else found
         method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
         status = f"{_status_of_noise(found, unit)}; before: {status}"
         gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
@@ -138,21 +145,29 @@ def design_exact(
 def _by_windows(
     problem: Problem,
     starts: Mapping[str, StackedGains],
+    after: float,
     *,
     budget: Budget,
     progress: Callable[[Progress], None] | None,
     dask: str | None,
 ) -> Descent:
-    """Windows first, from which the whole network's search goes on where there are time and memory for it."""
-    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask)
+    """Windows first, from which the whole network's search goes on where there are time and memory for it.
+
+    `after`: the seconds that choice and proof will take. Windows may take these too: they are worth the most.
+    """
+
+    def report(done: int, of: int) -> None:
+        if progress is not None:
+            phase = f"window {done} of {of}; Ctrl-C keeps what is done"
+            progress(Progress("", WEIGHT_OF_WINDOWS, 0, math.inf, budget.spent, 0, phase=phase))
+
+    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
+    budget.keep(after)
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
-    descent = descend(
-        problem,
-        {"windows": windowed.gains},
-        first=WEIGHT_OF_WINDOWS,
-        budget=Budget(0.0) if ended else budget,
-        progress=progress,
-    )
+    if ended:
+        budget.end()
+    start = {"windows": windowed.gains}
+    descent = descend(problem, start, first=WEIGHT_OF_WINDOWS, budget=budget, progress=progress, fewest=_FEWEST)
     return descent._replace(ended=ended) if ended else descent
 
 

@@ -7,6 +7,7 @@ the cost of all windows together grows as the number of nodes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -60,24 +61,33 @@ def _with_neighbours(linked: NDArray[np.bool_], nodes: Indices) -> Indices:
     return np.flatnonzero(inside)
 
 
-def window_gains(problem: Problem, gains: StackedGains, *, budget: Budget, dask: str | None = None) -> Windowed:
+def window_gains(
+    problem: Problem,
+    gains: StackedGains,
+    *,
+    budget: Budget,
+    dask: str | None = None,
+    report: Callable[[int, int], None] = lambda done, of: None,
+) -> Windowed:
     """The given gains, and in their place, for every core, those of its window, where that has stable ones.
 
     On the processes of `designer.workers.each`; the numbers do not depend on who computes them. KeyboardInterrupt and
     the end of the budget leave the rest as it is. Where the errors then grow, the way back is gone by
-    halves, and at last to its beginning.
+    halves, and at last to its beginning. `report` gets how many are done, of how many.
     """
     found, ended = windows(problem), None
     K_bar, H_bar = (part.copy() for part in gains)
     columns, nx = measurement_slices(problem), problem.nx
     try:
-        for (core, nodes), result in zip(found, each(_descended, _parts(problem, found), dask=dask), strict=True):
+        results = each(_descended, _parts(problem, found), dask=dask)
+        for done, ((core, nodes), result) in enumerate(zip(found, results, strict=True), 1):
             if result is not None:
                 rows = _entries(core, nx)
                 own = np.isin(_entries(nodes, nx), rows)
                 measured = np.concatenate([np.arange(columns[j].start, columns[j].stop) for j in nodes])
                 K_bar[:, rows[:, None], _entries(nodes, nx)] = result[0][:, own]
                 H_bar[:, rows[:, None], measured] = result[1][:, own]
+            report(done, len(found))
             budget.check()
     except KeyboardInterrupt:
         ended = "interrupted"

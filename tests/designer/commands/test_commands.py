@@ -144,13 +144,18 @@ def test_what_an_estimate_may_miss_the_budget_bounds(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """How slowly errors decay at the least gain is not known beforehand; that the budget ends the search is."""
-    for seconds, said in (
-        (120.0, "2 minutes here, or up to 3 minutes where"),
-        (1000.0, "3 minutes of about 17 minutes here; "),
+    for seconds, large, said in (
+        ((40.0, 120.0, 180.0), 1e9, "40 seconds to 3 minutes here, about 2 minutes as a rule, the longer"),
+        ((40.0, 1000.0, 180.0), 1e8, "40 seconds to 3 minutes here, the longer the more slowly"),
+        ((180.0, 1000.0, 180.0), 1e8, "3 minutes here, the longer"),
     ):
-        monkeypatch.setattr(effort, "seconds_of_exact", lambda problem, found=seconds: found)
-        assert run("design", "two-nodes", "-o", "gains.json", "--force", "--budget", "180s") == 0
-        assert capsys.readouterr().err.startswith(f"method exact: it takes about {said}")
+        found = effort.Seconds(*seconds)
+        monkeypatch.setattr(effort, "seconds_within", lambda problem, budget, found=found: found)
+        monkeypatch.setattr(effort, "LARGE", large)
+        assert run("design", "two-nodes", "-o", "gains.json", "--force", "--budget", "0.001s") == 0
+        printed = capsys.readouterr().err
+        assert printed.startswith(f"method exact: it takes {said}")
+        assert ("; up to 0.2 GB of memory; " in printed) == (large == 1e8)
 
 
 @pytest.mark.parametrize("text", ["0", "10 min", "1d", "-1s", "min"])
@@ -410,9 +415,14 @@ def test_the_progress_of_a_design_says_how_much_is_done(capsys: pytest.CaptureFi
     assert [progress.round for progress in told] == sorted(progress.round for progress in told)
     assert {progress.rounds for progress in told} == {told[-1].round}  # it has come to the last one
     show = design_command._descent_progress(600.0)
-    for seconds in (1.0, 2.5, 3.0, 4.5):
-        show(told[-1]._replace(seconds=seconds))
+    for seconds, whole in ((1.0, 2.0), (2.5, 1000.0), (3.0, 4.0), (4.5, 40.0)):
+        show(told[-1]._replace(seconds=seconds, whole=whole))
     said = capsys.readouterr().err.splitlines()
-    assert [line.split(" at most, ")[0].strip() for line in said] == ["2 s of 10 minutes", "4 s of 10 minutes"]
+    assert [line.split(" at most, ")[0].strip() for line in said] == [
+        "2 s of 10 minutes",
+        f"4 s of about 40 seconds if {told[-1].horizon} steps are enough, 10 minutes",
+    ]
+    design_command._descent_progress(600.0, alone=False)(told[-1]._replace(seconds=4.5, whole=40.0))
+    assert "about" not in capsys.readouterr().err
     assert f"round {told[-1].round} of {told[-1].rounds}, from start, " in said[0]
     assert said[0].endswith("; Ctrl-C keeps the best so far")

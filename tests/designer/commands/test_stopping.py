@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,31 @@ def test_a_signal_ends_the_search_and_a_second_one_nothing(
 ) -> None:
     """The first comes during the search, the second while its best gains are certified."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    monkeypatch.setattr(command, "_descent_progress", lambda budget: raising(first, lambda progress: None))
+    monkeypatch.setattr(command, "_descent_progress", lambda *_, **__: raising(first, lambda progress: None))
     monkeypatch.setattr(exact_design, "certify", raising(signal.SIGINT, exact_design.certify))
     assert main(["design", "two-nodes", "-o", str(tmp_path / "gains.json")]) == 0
     assert capsys.readouterr().err == f"{STOPPING}\n{STOPPED}\n"
     assert Gains.load(tmp_path / "gains.json").solver.status.startswith("interrupted")
     assert main(["verify", str(tmp_path / "gains.json")]) == 0
     assert {number: signal.getsignal(number) for number in before} == before
+
+
+def test_a_signal_whose_exception_is_lost_ends_the_search_at_its_next_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in a callback of a library, from which nothing is raised."""
+    told: list[Progress] = []
+
+    def tell(progress: Progress) -> None:
+        told.append(progress)
+        with suppress(KeyboardInterrupt):
+            if len(told) == 3:
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(command, "_descent_progress", lambda *_, **__: tell)
+    assert main(["design", "two-nodes", "-o", str(tmp_path / "gains.json")]) == 0
+    assert [progress.steps for progress in told if progress.phase is None] == [1, 2, 3]
+    assert Gains.load(tmp_path / "gains.json").solver.status.startswith("interrupted")
 
 
 @pytest.mark.parametrize("work", ["certify", "recover"])

@@ -18,8 +18,8 @@ from networks import random_gains, random_problem, real_network, real_networks
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
-from benchmarks.design import banded
-from designer.gain.exact import exact_gain
+from benchmarks.design import NETWORKS, banded
+from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.gain.floor import floor
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
@@ -27,17 +27,22 @@ from designer.problems import find
 from designer.search import descent
 from designer.search.barrier import Barrier
 from designer.search.descent import Budget, Descent, Progress, TimeIsUp, descend, to_its_end
-from designer.search.effort import gradients_of_exact
-from designer.search.starts import consensus_gains, least_variance_gains
+from designer.search.effort import gradients_of_exact, seconds_of_exact, seconds_within
+from designer.search.starts import consensus_gains, ignoring, least_variance_gains
 
 
 class Counted(NamedTuple):
+    """A search by a clock that counts gradients over 20 steps; one over 40 counts twice."""
+
+    problem: Problem
     found: Descent
-    gradients: float  # over 20 steps; one over 40 counts twice
+    gradients: float
+    told: list[Progress]
 
 
 def counted(problem: Problem) -> Counted:
     """A descent from gains of least variance, made without any solver."""
+    told: list[Progress] = []
     asked: list[float] = []
     swept = Barrier._swept
 
@@ -47,8 +52,9 @@ def counted(problem: Problem) -> Counted:
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Barrier, "_swept", counting)
-        found = descend(problem, {"least variance": least_variance_gains(problem)})
-    return Counted(found, sum(asked))
+        budget, start = Budget(clock=lambda: sum(asked)), {"least variance": least_variance_gains(problem)}
+        found = descend(problem, start, budget=budget, progress=told.append)
+    return Counted(problem, found, sum(asked), [progress for progress in told if progress.phase is None])
 
 
 @pytest.fixture(scope="module")
@@ -62,13 +68,20 @@ def ideal(ideal_counted: Counted) -> Descent:
     return ideal_counted.found
 
 
-def test_the_estimate_is_within_a_factor_2_of_the_gradients_that_a_search_takes(ideal_counted: Counted) -> None:
-    """So far as that can be said beforehand: of these two it is, of a few others it is not."""
-    for problem, gradients in (
-        (find("zhu2020-ideal"), ideal_counted.gradients),
-        (find("two-nodes"), counted(find("two-nodes")).gradients),
-    ):
-        assert 0.5 < gradients_of_exact(problem) / gradients < 2.0, problem.name
+def test_what_is_said_of_a_search_is_true(ideal_counted: Counted) -> None:
+    """Beforehand the least that it takes; on the way all of it, to a factor 2, once the horizon is long enough.
+
+    Of two of these networks 20 steps are long enough, of the third 40, at last. As a rule the estimate beforehand is
+    within a factor 2.5.
+    """
+    for each in (ideal_counted, counted(find("two-nodes")), counted(NETWORKS["ring-2"](seed=1))):
+        of_one = seconds_of_exact(each.problem) / gradients_of_exact(each.problem)
+        assert seconds_within(each.problem, math.inf).least < each.gradients * of_one
+        assert 0.4 < gradients_of_exact(each.problem) / each.gradients < 2.5
+        horizon = each.told[-1].horizon
+        said = [progress.whole / each.gradients for progress in each.told if progress.horizon == horizon]
+        assert 0.5 < min(said) <= max(said) < 2.0
+        assert said[-1] > 0.7
 
 
 def alone(problem: Problem, starts: Mapping[str, StackedGains]) -> dict[str, Descent]:
@@ -200,6 +213,55 @@ def test_what_there_is_is_kept_when_time_is_over(evaluations: int) -> None:
     assert before.stable
     assert (found.steps == 0) == (evaluations < 2)
     assert found.chosen.gain.high < 0.9 * before.high if found.steps else found.chosen.gain.high == before.high
+
+
+@pytest.fixture(scope="module")
+def slow() -> tuple[Problem, StackedGains]:
+    """A plant whose errors last for a hundred steps, and a start that decays as slowly."""
+    problem = real_network(find("two-nodes"), radius=0.99)
+    return problem, ignoring(problem)
+
+
+def test_a_search_from_nearby_looks_as_far_as_the_start_needs(slow: tuple[Problem, StackedGains]) -> None:
+    """To a twentieth of its exact gain."""
+    model, told = error_model(slow[0], *slow[1]), []
+
+    def tell(progress: Progress) -> None:
+        told.append(progress.horizon)
+        raise KeyboardInterrupt
+
+    search = descent._Search(slow[0], Budget(), tell, fewest=1)
+    with pytest.raises(KeyboardInterrupt):
+        search.run({"near": slow[1]}, (descent.NEAR,))
+    nearly = (exact_gain(model).high / 1.06) ** 2
+    assert horizon_gain(Operator(model), told[0])[0] > nearly > horizon_gain(Operator(model), told[0] // 4)[1]
+
+
+def test_a_search_that_sees_nothing_of_a_slow_decay_is_not_tried(
+    slow: tuple[Problem, StackedGains], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descent, "_LONGEST", 20)
+    found = descend(slow[0], {"near": slow[1]}, fewest=1)
+    assert (found.ended, found.steps) == ("errors decay too slowly for a search over 20 steps", 0)
+    assert np.array_equal(found.chosen.H_bar, slow[1][1])
+
+
+@pytest.mark.parametrize(("fewest", "steps"), [(30, 0), (10, 1)])
+def test_a_search_that_comes_to_nothing_in_its_time_is_not_tried(fewest: int, steps: int) -> None:
+    """By a clock that knows evaluations alone, of which there is time for twenty, and for a step."""
+    problem, asked = find("two-nodes"), []
+    swept = Barrier._swept
+
+    def counting(barrier: Barrier, *rest: Any, **more: Any) -> Any:
+        asked.append(1.0)
+        return swept(barrier, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Barrier, "_swept", counting)
+        budget = Budget(20.0, clock=lambda: sum(asked))
+        found = descend(problem, {"near": least_variance_gains(problem)}, budget=budget, fewest=fewest)
+    assert found.ended == "out of time"
+    assert (found.steps > 0) == (steps > 0)
 
 
 def test_a_second_thought_while_the_choice_is_made_does_not_lose_it(monkeypatch: pytest.MonkeyPatch) -> None:

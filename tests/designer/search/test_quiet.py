@@ -99,6 +99,20 @@ def test_a_search_that_is_stopped_keeps_what_it_has(pendulum: Gains, reason: str
     assert np.isfinite(found.gains.K_bar).all()
 
 
+def test_ctrl_c_before_it_begins_ends_it_too() -> None:
+    """Pressed in the search for the least gamma: no other one follows."""
+    steps: list[Progress] = []
+
+    def stop(at: Progress) -> None:
+        if at.phase is None:
+            steps.append(at)
+            raise KeyboardInterrupt
+
+    gains = design(find("two-nodes"), peak_slack=0.05, progress=stop)
+    assert len(steps) == gains.solver.iterations == 1
+    assert gains.solver.status.startswith("interrupted; E|z~|^2 under white w from ")
+
+
 @pytest.mark.parametrize(
     ("method", "slack", "says"),
     [("theorem2", 0.1, "method theorem2 has none"), ("exact", -0.1, "0 or more"), ("exact", float("inf"), "0 or more")],

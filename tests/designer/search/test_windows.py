@@ -61,8 +61,10 @@ def test_of_each_window_the_gains_of_its_core_are_kept(small: None) -> None:
     """They are those that its own network has, at the same nodes; the exact gain of all falls far."""
     problem = shuffled(banded(20))
     start = least_variance_gains(problem)
-    found = window_gains(problem, start, budget=Budget())
+    told: list[tuple[int, int]] = []
+    found = window_gains(problem, start, budget=Budget(), report=lambda *done: told.append(done))
     assert found.ended is None
+    assert told == [(1, 3), (2, 3), (3, 3)]
     columns = measurement_slices(problem)
     for core, nodes in windows(problem):
         names = [problem.node_names[i] for i in nodes]
