@@ -74,7 +74,7 @@ def tolerant(problem: Problem, assumed: Problem, counts: Counts, *, level: float
     for k, count in delivered.items():
         _may_be(document["link"][k], "delivery_probability", links[k].delivery_probability, interval(count, each))
     if any(len(row) > 1 for row in rows):
-        document["markov"]["tolerance"] = {"transition": [_total_variation(row, each) for row in rows]}
+        document["markov"]["tolerance"] = {"transition": [total_variation(row, each) for row in rows]}
     return Problem.from_document(document)
 
 
@@ -87,13 +87,20 @@ def _may_be(part: dict[str, Any], name: str, value: float, ends: tuple[float, fl
     part["tolerance"] = part.get("tolerance", {}) | {name: sides}
 
 
-def _total_variation(row: Sequence[Count], level: float) -> float:
-    """Half of sum |pi - p| is the sum of what some entries gain, and of what others lose."""
-    if len(row) < 2:
+def total_variation(row: Sequence[Count], level: float) -> float:
+    """Half of sum |pi - p| is the sum of what some entries gain, and of what others lose; `level` for each entry.
+
+    Half of that goes to the intervals of the entries, and half to the row: with k entries and N exits, sum |pi - p| is
+    eps or more with probability (2^k - 2) exp(-N eps^2 / 2) at most (Weissman et al. 2003). So the lesser holds.
+    """
+    k, exits = len(row), row[0].trials if row else 0
+    if k < 2:
         return 0.0
-    ends = [(count.share, *interval(count, level)) for count in row]
+    ends = [(count.share, *interval(count, level / 2.0)) for count in row]
     gained, lost = sum(high - share for share, _, high in ends), sum(share - low for share, low, _ in ends)
-    return min(_above(min(gained, lost)), 1.0)
+    subsets = k * math.log(2.0) + math.log1p(-(2.0 ** (1 - k)))  # log of 2^k - 2
+    of_row = math.sqrt(2.0 / exits * (subsets - math.log(k * level / 2.0))) / 2.0
+    return min(_above(min(gained, lost, of_row)), 1.0)
 
 
 def _above(size: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from made_recordings import uncertified
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.roles.plant import SimulatedPlant
+from designer.cli import main
 from designer.gain.start import left_by_start
 from designer.ledger.account import account
 from designer.model.error_model import error_model, initial_eta, link_gains, realised
@@ -89,6 +91,19 @@ def test_a_bound_that_forgets_the_start_is_refuted(gains: Gains) -> None:
     ensemble = simulate(gains, runs=50, steps=5)
     assert (ensemble.least > 0.0).any()
     assert ensemble.energy.max() == 0.0
+
+
+def test_simulate_calls_the_bound_what_it_is(gains: Gains, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With a start it is not gamma^2 energy, and the root of mean over energy is no gain."""
+    path = tmp_path / "gains.json"
+    impulse = gains.problem.with_(disturbance={"kind": "impulse"})
+    for problem, start in ((impulse, True), (impulse.with_(plant={"initial_error": None}), False)):
+        uncertified(problem, gains.K, gains.H, method="given").save(path, force=True)
+        assert main(["simulate", str(path), "--runs", "20", "--steps", "5", "--processes", "1"]) == 0
+        said = capsys.readouterr().out
+        assert ("(gamma sqrt(energy) + start)^2" in said) is start
+        assert ("gamma^2 energy" in said) is not start
+        assert ("the root of mean over energy" in said) is not start
 
 
 def test_the_value_of_the_start_is_exact(gains: Gains) -> None:

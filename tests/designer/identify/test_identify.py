@@ -18,7 +18,7 @@ from agent.contract.problem import Problem
 from designer.box.extent import box_in
 from designer.cli import main
 from designer.identify.counts import Count, Counts, counts_of, total
-from designer.identify.estimate import observed, tolerant
+from designer.identify.estimate import observed, tolerant, total_variation
 from designer.identify.fit import Finding, findings, interval, likelihood_ratio
 from designer.problems import find, names
 from designer.problems.written import to_toml
@@ -286,3 +286,16 @@ def test_tolerances_that_are_each_at_the_level_miss_the_truth_more_often() -> No
     number = 14  # about what it divides by
     found = [tolerant(observed(PROBLEM, counts), PROBLEM, counts, level=LEVEL * number) for counts in every]
     assert sum(not inside(problem, PROBLEM) for problem in found) > 12 + 3 * math.sqrt(120 * 0.1 * 0.9)
+
+
+def test_a_row_of_many_modes_is_narrower_than_its_entries_and_misses_as_seldom_as_it_says() -> None:
+    """Of 4 entries; what nine times as many exits would say is too narrow."""
+    pi, exits, level, rng = np.array([0.5, 0.2, 0.1, 0.2]), 176, 0.2, np.random.default_rng(1)
+    drawn_rows = rng.multinomial(exits, pi, size=400)
+    far = np.abs(drawn_rows / exits - pi).sum(axis=1) / 2.0
+    said = np.array([total_variation([Count(int(hits), exits) for hits in row], level / 4) for row in drawn_rows])
+    assert (far > said).mean() <= level
+    entries = [interval(Count(int(hits), exits), level / 8) for hits in drawn_rows[0]]
+    assert said[0] < 0.8 * sum(high - hits / exits for (_, high), hits in zip(entries, drawn_rows[0], strict=True))
+    narrow = np.array([total_variation([Count(int(h), 9 * exits) for h in 9 * row], level / 4) for row in drawn_rows])
+    assert (far > narrow).mean() > level
