@@ -79,7 +79,7 @@ ROOMS = {
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
     "designer.simulation": "designer.gain designer.model designer.workers",
-    "designer.ledger": "designer.gain designer.model designer.proof",
+    "designer.ledger": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.chance": "designer.single_run designer.start",
     "designer.replay": "agent.contract.recording designer.chance designer.gain designer.ledger designer.model "
     "designer.proof",

@@ -18,11 +18,12 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from designer.coordinates import Coordinates
 from designer.gain.exact import InvariantSet, Operator, lyapunov
 from designer.gain.exact import step as backwards
 from designer.ledger.deviation import AS_DESIGNED, Acting, Deviation, Models, Unabsorbed
 from designer.ledger.promise import SHARE, VOID_ABOVE, Owed, Promise
-from designer.model.error_model import error_model, stacked_gains
+from designer.model.error_model import error_model, stacked_links
 
 _WIDTH = 1e-4  # relative width of a gain that is searched
 _MEMORY = 64  # steps that are kept one by one, beside twice those that the recursion takes as designed
@@ -50,10 +51,14 @@ class _Debt:
 class Ledger:
     """Stands at a step k, from 0; is told what happens in it and of jumps; steps; and says what the bound says.
 
-    `gamma` bounds the gain of these gains as designed, and P (modes, n_eta, n_eta) satisfies (17).
+    `gamma` bounds the gain of these gains as designed, and P (modes, n_eta, n_eta) satisfies (17). All of that is of
+    [T x; T e] where T is given; jumps are of [x; e].
     """
 
-    def __init__(self, problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float, P: Array) -> None:
+    def __init__(
+        self, problem: Problem, K_bar: Array, H_bar: Array, *, gamma: float, P: Array, T: Array | None = None
+    ) -> None:
+        self._T = T
         self.models, self.gamma, self.k = Models(problem, K_bar, H_bar), gamma, 0
         self._g, self._P = gamma**2 * (1.0 + 1e-9), P  # a rounding above: to hold at it is to be valid
         self._set = InvariantSet(P)
@@ -70,18 +75,21 @@ class Ledger:
         """For what the certificate of a gains file claims; where that stores no P, one is made here, in floats."""
         from designer.proof.certificate import lyapunov_matrix  # loads ball arithmetic
 
-        K_bar, H_bar = stacked_gains(gains)
-        P = None
+        problem, K, H, T, P = gains.problem, gains.K, gains.H, None, None
         if gains.certificate.form == "summed":
-            P, _ = lyapunov(Operator(error_model(gains.problem, K_bar, H_bar)))
+            coordinates = Coordinates.of(problem)
+            if coordinates is not None:
+                T, (K, H), problem = coordinates.T, coordinates.there(K, H), coordinates.problem
+            P, _ = lyapunov(Operator(error_model(problem, *stacked_links(problem, K, H))))
         if P is None:
             P = lyapunov_matrix(gains)
-        return cls(gains.problem, K_bar, H_bar, gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0)
+        of_links = stacked_links(problem, K, H)
+        return cls(problem, *of_links, gamma=gains.certificate.gamma, P=(P + P.swapaxes(1, 2)) / 2.0, T=T)
 
     def anew(self, k: int) -> Ledger:
         """One of the same network that stands at step k, and has been told nothing."""
         models = self.models
-        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._P)
+        other = Ledger(models.problem, models.K_bar, models.H_bar, gamma=self.gamma, P=self._P, T=self._T)
         other.models, other.k = models, k  # the models that were made
         return other
 
@@ -101,6 +109,9 @@ class Ledger:
         For a delta that is known, delta delta' in the mode of this step. `is_unit`: the length of it is not known,
         and `covariance` is for length 1.
         """
+        if self._T is not None:
+            whole = np.kron(np.eye(covariance.shape[1] // len(self._T)), self._T)
+            covariance = whole @ covariance @ whole.T
         self._debts.append(_Debt(what, is_unit, covariance, self._size(covariance)))
 
     def void(self, reason: str) -> None:

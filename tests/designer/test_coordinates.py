@@ -15,16 +15,19 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer import problems
+from designer.analysis import certified, given
 from designer.beyond_gamma import beyond_gamma
 from designer.box.extent import Box, box_of, corners, within
 from designer.box.robust import proved_at, robust
 from designer.box.worst import There, worst
 from designer.coordinates import Coordinates, fractions
-from designer.gain.exact import exact_gain, node_gains
+from designer.gain.exact import Operator, exact_gain, lyapunov, node_gains
 from designer.gain.noise import long_run, steady_state
 from designer.gain.worst_case import worst_fixed
+from designer.ledger.deviation import Deviation
+from designer.ledger.exact import Ledger
 from designer.lmi.multipliers import least_of_lmi, multipliers
-from designer.model.error_model import link_gains, model_of_gains
+from designer.model.error_model import error_model, link_gains, model_of_gains, stacked_links
 from designer.model.units import NaturalUnits
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import part
@@ -391,3 +394,30 @@ def test_what_is_above_all_corners_does_not_depend_on_units() -> None:
     units = np.array([2.0**20, 1.0, 2.0**-20, 2.0**3])
     both = np.outer(units, units)
     np.testing.assert_allclose(upper_bound(S * both, X / both), upper_bound(S, X) * both, rtol=1e-12)
+
+
+# the ledger
+def test_the_ledger_says_the_same_of_both_coordinates_while_floats_know_both() -> None:
+    """After a fault and a jump: at 1e-3, among the states as they are; at 1e-10 nothing else has become of it."""
+    factors = []
+    for epsilon in (1e-3, 1e-10):
+        problem = cancelling(epsilon)
+        K, H = good_gains(problem)
+        gains = certified(problem, given(problem, K, H, source="here", file=None))
+        stacks = stacked_links(problem, gains.K, gains.H)
+        P, _ = lyapunov(Operator(error_model(problem, *stacks)))
+        assert P is not None
+        books = [Ledger.of(gains), Ledger(problem, *stacks, gamma=gains.certificate.gamma, P=P)]
+        jump = np.zeros((2, 9, 9))
+        jump[0, 3, 3] = epsilon**2
+        for book in books:
+            book.tell(Deviation(unmeasured=frozenset({0})))
+            book.step()
+            book.tell(Deviation())
+            book.jump(jump, "a push")
+            book.step()
+        if epsilon == 1e-3:
+            assert books[0].owed() == pytest.approx(books[1].owed(), rel=1e-9)
+            assert books[0].gain() == pytest.approx(books[1].gain(), rel=1e-3)
+        factors.append(books[0].gain() / gains.certificate.gamma)
+    assert factors[1] == pytest.approx(factors[0], rel=0.05)
