@@ -5,8 +5,8 @@
 The networks are `banded` of benchmarks/design.py, and every number of seconds is processor time of one core. Of each
 network: gains of least variance and their proof, by floats and, up to 20 nodes, by balls; windows, where there are
 more than one; a gradient of the search over 20 steps; the search from gains of least variance, for each node at most
-`--budget` seconds; and the proof of what it chose. Searches of networks of every size are compared where they are equally
-near to their own ends: where gamma in hand has come within `--part` of the last, for good, starts and all.
+`--budget` seconds; and the proof of what it chose. Searches are compared where they are equally near to their own ends:
+where gamma in hand has come within `--part` of the last, for good. The start is counted.
 """
 
 from __future__ import annotations
