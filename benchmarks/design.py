@@ -2,6 +2,7 @@
 
     python benchmarks/design.py [--decomposed 4 8 12 25 50 100 200] [--literal 4 8 12]
                                 [--exact 4 6 20 50 100 200] [--budget SECONDS]
+                                [--problems zhu2020-ideal quadruple-tank ...]
                                 [--networks zhu2020-ideal zhu2020-lossy ring-1 ...] [--seed 1]
 
 First the networks `banded`, with 4 modes and 2 states: the paper's LMI as printed beside the decomposed one, large
@@ -10,8 +11,10 @@ is its own. "solver" is the solver's own part, "whole" everything from problem t
 time of the whole, which other programs on the machine disturb less; "verify" is the processor time of proving the
 file again.
 
-Then the ladder of the paper's two examples and of four random networks: Theorem 2's gamma and the exact gain of its
-gains, the exact gain of Kalman-consensus gains, what the search for the least exact gain certifies, and the floor.
+Then what the search found of the built-in problems: the LMI that it begins with, the exact gain of that one's gains,
+the least gamma and the chosen one with the norm of the gains and their radius, and the floor. At last the ladder of
+the paper's two examples and of four random networks: Theorem 2's gamma and the exact gain of its gains, the exact gain
+of Kalman-consensus gains, what the search for the least exact gain certifies, and the floor.
 An empty list leaves a part out.
 """
 
@@ -54,8 +57,10 @@ assert verify(Gains.from_bytes(gains.canonical(), source="memory")).holds
 print(json.dumps({
     "solver": gains.solver.seconds, "whole": whole, "cpu": cpu, "certify": gains.seconds["certify"],
     "verify": time.process_time() - started,
-    "lmi_gamma": proved.lmi_gamma, "gamma": proved.gamma, "exact": proved.exact, "floor": proved.floor,
+    "lmi_gamma": proved.lmi_gamma, "lmi_exact": proved.lmi_exact, "gamma": proved.gamma,
+    "exact": proved.exact, "floor": proved.floor,
     "form": proved.form, "status": gains.solver.status.partition(";")[0],
+    "found": gains.solver.status.rpartition("; ")[2],
     "iterations": gains.solver.iterations, "file": len(gains.canonical()) / 1e6,
     "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
 }))
@@ -63,9 +68,11 @@ print(json.dumps({
 
 
 def network(name: str, *, seed: int = 1) -> Problem:
-    """A network by its name: "banded-12" has 12 nodes; else one of NETWORKS."""
+    """A network by its name: "banded-12" has 12 nodes; else one of NETWORKS, or a built-in problem."""
     kind, _, number = name.partition("-")
-    return banded(int(number), seed=seed) if kind == "banded" else NETWORKS[name](seed=seed)
+    if kind == "banded":
+        return banded(int(number), seed=seed)
+    return NETWORKS[name](seed=seed) if name in NETWORKS else find(name)
 
 
 def banded(n: int, *, seed: int = 1) -> Problem:
@@ -141,13 +148,14 @@ def random_network(
 
 
 NETWORKS: dict[str, Callable[..., Problem]] = {
-    "zhu2020-ideal": lambda *, seed: find("zhu2020-ideal"),
-    "zhu2020-lossy": lambda *, seed: find("zhu2020-lossy"),
     "ring-1": partial(random_network, 1, n=3, nx=2, modes=2, arrival=(0.75, 0.95), ring=True),
     "ring-2": partial(random_network, 2, n=3, nx=2, modes=2, arrival=(0.75, 0.95), ring=True),
     "3-states": partial(random_network, 3, n=4, nx=3, modes=3, arrival=(0.75, 0.95)),
     "heavy-loss": partial(random_network, 4, n=4, nx=2, modes=2, arrival=(0.3, 0.5)),
 }
+PAPER = ["zhu2020-ideal", "zhu2020-lossy"]
+PROBLEMS = [*PAPER, "quadruple-tank", "two-nodes", "inverted-pendulum"]
+LADDER = [*PAPER, *NETWORKS]
 
 
 def measure(method: str, name: str, seed: int, budget: float = math.inf) -> dict[str, Any]:
@@ -189,6 +197,14 @@ def summary(measured: dict[tuple[str, int], dict[str, Any]]) -> list[str]:
     return lines
 
 
+def found_row(name: str) -> str:
+    """What the search found of one problem."""
+    facts = measure("exact", name, 1)
+    lmi, own = (facts["lmi_gamma"], facts["lmi_exact"][1]) if facts["lmi_gamma"] else (math.nan, math.nan)
+    before = f"{name:<18}LMI {lmi:.6f}, its gains {own:.6f}"
+    return f"{before}; {facts['found']}; floor {facts['floor']:.6g}; {facts['cpu']:.1f} cpu s"
+
+
 LADDER_HEAD = (
     f"{'network':<15}{'printed':>8}{'Theorem 2':>11}{'its exact':>11}{'consensus':>11}{'designed':>11}{'floor':>11}"
     f"{'against T2':>12}{'cpu s T2':>10}{'cpu s designed':>16}"
@@ -215,7 +231,8 @@ def main() -> None:
     parser.add_argument(
         "--budget", type=float, default=math.inf, metavar="SECONDS", help="for exact, of processor time"
     )
-    parser.add_argument("--networks", nargs="*", default=list(NETWORKS), choices=list(NETWORKS), metavar="NAME")
+    parser.add_argument("--problems", nargs="*", default=PROBLEMS, choices=PROBLEMS, metavar="NAME")
+    parser.add_argument("--networks", nargs="*", default=LADDER, choices=LADDER, metavar="NAME")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     measured: dict[tuple[str, int], dict[str, Any]] = {}
@@ -227,6 +244,8 @@ def main() -> None:
         measured[method, n] = measure(method, f"banded-{n}", options.seed, options.budget)
         print(row(method, n, measured[method, n]), flush=True)
     print("\n".join(summary(measured)))
+    for name in options.problems:
+        print(found_row(name), flush=True)
     if options.networks:
         print(LADDER_HEAD)
     for name in options.networks:

@@ -22,8 +22,9 @@ from designer.ladder import percent, rounded_up
 from designer.lmi.back_off import least_gamma
 from designer.model.error_model import StackedGains, error_model, model_of_gains, stacked_gains, stacked_links
 from designer.proof.certificate import lyapunov_matrix
-from designer.search.descent import NEAR
+from designer.search.descent import NEAR, ROUGH
 from designer.search.effort import default_method
+from designer.search.starts import least_variance_gains
 from designer.workers import each, greet_cluster
 
 _SHARE = 0.5  # of the time of a design that one from near gains takes
@@ -127,8 +128,9 @@ def price(
 ) -> PriceTable:
     """Design the whole network, then without each part in turn, on the processes of `designer.workers.each`.
 
-    Method "exact" starts each of these from the whole network's gains, and goes to the end of each search. `report`
-    gets how many designs are done, of how many, and the last of them in words.
+    Method "exact" starts each of these from the whole network's gains, unless others are better without the part, and
+    ends each search a little before its end. `report` gets how many designs are done, of how many, and the last of
+    them in words.
     """
     if dask is not None:
         greet_cluster(dask)  # before the first design, which may take minutes
@@ -203,12 +205,20 @@ def _design(problem: Problem, method: str, start: StackedGains | None = None) ->
     from designer.synthesis import design
 
     if method == "exact" and start is not None:
-        gains = design_exact(problem, starts={"whole network": start}, first=NEAR)
+        starts, first = _begun(problem, start)
+        gains = design_exact(problem, starts=starts, first=first, last=ROUGH)
     else:
         gains = design(problem, method=method, budget=math.inf)
     if gains.solver.status.startswith("interrupted"):  # the best gains so far are no price
         raise KeyboardInterrupt
     return gains
+
+
+def _begun(problem: Problem, start: StackedGains) -> tuple[dict[str, StackedGains], float]:
+    """What a search without a part begins with, and the first mu: the start, which is near, unless others do better."""
+    others = least_variance_gains(problem)
+    near, far = (exact_gain(error_model(problem, *gains)).high for gains in (start, others))
+    return ({"whole network": start}, NEAR) if near <= far else ({"least variance": others}, math.inf)
 
 
 def _bound_for(whole: Gains, rest: Problem) -> float:

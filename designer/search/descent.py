@@ -33,6 +33,7 @@ from designer.search.outlook import Outlook
 Made = TypeVar("Made")
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
 NEAR = 9e-4  # the first mu where the start is near
+ROUGH = 9e-5  # the last one where some hundredths of a percent do not matter
 _SLACK = 1.001  # gamma may be this factor above the least one found, for gains that are small and decay fast
 _RIDGE = 20.0  # of the centring: with less, gains of a flat minimum shrink so slowly that the search ends first
 _HORIZON = 20
@@ -176,12 +177,14 @@ def descend(
     starts: Mapping[str, StackedGains],
     *,
     first: float = math.inf,
+    last: float = 0.0,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     held: NDArray[np.bool_] | None = None,
     fewest: int = 0,
 ) -> Descent:
-    """The least exact gain found from the best of the given starts; larger mu than `first` are passed over.
+    """The least exact gain found from the best of the given starts; larger mu than `first` are passed over, as are
+    smaller ones than `last`.
 
     `held`: as `Entries` takes it.
 
@@ -192,7 +195,7 @@ def descend(
     search = _Search(problem, Budget() if budget is None else budget, progress, held, fewest)
     ended = "converged"
     try:
-        search.run(starts, tuple(mu for mu in _WEIGHTS if mu <= first))
+        search.run(starts, tuple(mu for mu in _WEIGHTS if last <= mu <= first))
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:

@@ -50,6 +50,7 @@ def design_exact(
     *,
     starts: Mapping[str, StackedGains] | None = None,
     first: float = math.inf,
+    last: float = 0.0,
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
@@ -61,10 +62,10 @@ def design_exact(
 
     With `slack` those of least noise whose exact gain is at most 1 + slack times that one.
 
-    `first`: as `descend` takes it. KeyboardInterrupt ends the search, and so does the end of the budget, which begins
-    when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is one.
-    `unit`: of z; it counts in the status alone. `held` (nx, nx): entries of K_ij that are to be 0, unless windows are
-    searched.
+    `first` and `last`: as `descend` takes them. KeyboardInterrupt ends the search, and so does the end of the budget,
+    which begins when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is
+    one. `unit`: of z; it counts in the status alone. `held` (nx, nx): entries of K_ij that are to be 0, unless windows
+    are searched.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
@@ -96,7 +97,7 @@ def design_exact(
         after = _STARTS_OF_THE_END * (begun - started)
         descent = _by_windows(problem, starts, after, budget=budget, progress=progress, dask=dask)
     else:
-        descent = descend(problem, starts, first=first, budget=budget, progress=progress, held=held)
+        descent = descend(problem, starts, first=first, last=last, budget=budget, progress=progress, held=held)
     descent = descent._replace(ended="interrupted") if stopped else descent
     chosen = descent.chosen
     if not chosen.gain.stable:
