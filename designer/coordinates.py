@@ -102,10 +102,11 @@ class Coordinates:
 def _cancelling(problem: Problem, taken: Any) -> tuple[int, int] | None:
     """A row of M that cancels, and the largest of what it is made of that is not yet `taken`, (nx,), for another."""
     spread, M = reached(problem), problem.plant.M
-    if not np.isfinite(spread).all():
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers near the ends of float64 nothing is said
+        parts = np.abs(M) * np.sqrt(np.diag(spread))
+        sizes = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", M, spread, M), 0.0))
+    if not (np.isfinite(parts).all() and np.isfinite(sizes).all()):
         return None
-    parts = np.abs(M) * np.sqrt(np.diag(spread))
-    sizes = np.sqrt(np.maximum(np.einsum("ri,ij,rj->r", M, spread, M), 0.0))
     parts_left = np.where(taken, 0.0, parts)
     for r in np.flatnonzero(sizes < _CANCELS * parts.sum(axis=1)):
         if parts_left[r].any():
