@@ -19,7 +19,7 @@ import pytest
 from here import here
 from places import GOLDEN
 from roles import Roles
-from runs import MANY, PATIENCE, answer, decoded, end_of, line_with, logged, peakmesh, program, run_here, started
+from runs import MANY, PATIENCE, answer, decoded, end_of, line_with, logged, program, run_here, started
 
 from agent.authority import Authority
 from agent.contract.errors import Interrupted, RunBroken
@@ -85,13 +85,13 @@ def test_it_watches_a_run_from_the_middle_and_leaves_without_harm(run: Roles, tm
         last = node(states[-1], "2")["step"]
         run.node("2")
         states += until(watch, lambda state: node(state, "2")["there"] and node(state, "2")["step"] > last)
-        once = answer(peakmesh(*words, GAINS, "--once", "--json"))
+        once = answer(here(*words, GAINS, "--once", "--json"))
         assert (once["run"], once["ended"]) == ("shown", None)
         other = tmp_path / "other.json"
         document = Gains.load(GAINS).document()
         document["solver"]["seconds"] += 1.0
         Gains.from_document(document).save(other)
-        refused = peakmesh(*words, other)
+        refused = here(*words, other)
         assert refused.returncode == 2
         assert 'run "shown" has other gains' in refused.stderr
         watch.send_signal(signal.SIGINT)
@@ -115,7 +115,7 @@ def test_it_watches_a_run_with_keys(tmp_path: Path) -> None:
             states = list(until(watch, is_complete))
         assert states[-1]["run"] == "shown"
         assert not states[-1]["gone"]
-        stranger = peakmesh("watch", "--connect", run.address, "--wait", "3", "--once")
+        stranger = here("watch", "--connect", run.address, "--wait", "3", "--once")
         assert stranger.returncode != 0
         assert run.coordinator.poll() is None
 
