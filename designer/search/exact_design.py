@@ -40,7 +40,7 @@ SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
 _STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
-_FEWEST = 100  # evaluations of the whole after windows: with less, all may be for nothing
+_FEWEST = 400  # evaluations of the whole after windows: with less, it may lead to nothing that is stable
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 

@@ -223,7 +223,7 @@ def slow() -> tuple[Problem, StackedGains]:
 
 
 def test_a_search_from_nearby_looks_as_far_as_the_start_needs(slow: tuple[Problem, StackedGains]) -> None:
-    """To a twentieth of its exact gain."""
+    """To a hundredth of its exact gain, or a little more."""
     model, told = error_model(slow[0], *slow[1]), []
 
     def tell(progress: Progress) -> None:
@@ -233,7 +233,7 @@ def test_a_search_from_nearby_looks_as_far_as_the_start_needs(slow: tuple[Proble
     search = descent._Search(slow[0], Budget(), tell, fewest=1)
     with pytest.raises(KeyboardInterrupt):
         search.run({"near": slow[1]}, (descent.NEAR,))
-    nearly = (exact_gain(model).high / 1.06) ** 2
+    nearly = (exact_gain(model).high / 1.03) ** 2
     assert horizon_gain(Operator(model), told[0])[0] > nearly > horizon_gain(Operator(model), told[0] // 4)[1]
 
 
