@@ -38,6 +38,11 @@ class Account(NamedTuple):
         """From the first step to the last, the bound said what it says of any run."""
         return self.last.status == "valid" and not self.faulty
 
+    @property
+    def is_without_faults(self) -> bool:
+        """The same, but for what the initial error leaves."""
+        return self.last.status != "void" and not self.faulty
+
     def text(self) -> str:
         """In one line, for people."""
         if self.last.status == "void" or not self.faulty:

@@ -201,12 +201,12 @@ class Tally:
 class PathAudit:
     """Proof 5, gathered block by block. If w is one number, the bound is an equality at step 1.
 
-    With an initial error it is one at step 0, where that is all there is.
+    With an initial error it is one until the first w.
     """
 
     def __init__(self, problem: Problem, part: Part) -> None:
         self._part, self._starts = part, bool(problem.initial_error.any())
-        self._equal_at = 0 if self._starts else 1 if problem.nw == 1 else -1
+        self._equal_at = 1 if problem.nw == 1 and not self._starts else -1
         self.holds, self.compared = True, 0
         self.margin, self.step = np.inf, -1  # the smallest, and where
         self.is_equality = False  # in that step, which says nothing, and is not in the margin
@@ -223,7 +223,7 @@ class PathAudit:
         within = path.error <= path.bound + rounding
         self.compared += int(known.sum())
         self.holds &= bool(within[known].all())
-        counts = known & (path.bound > 0.0)
+        counts = known & (path.bound > path.start)
         trivial = counts & within & (steps == self._equal_at)
         self.is_equality |= bool(trivial.any())
         counts &= ~trivial
@@ -246,7 +246,7 @@ class PathAudit:
             which = f"of {counted(self.silent, 'step')} {from_where}" if self.spoke_again else from_where
             why = f"it says nothing {which}, where rounding may be more than the bound"
             return f"{smallest}; {why}" if self.step >= 0 else why
-        if self.is_equality and self._equal_at == 1:
+        if self.is_equality:
             why = "at step 1 the bound is an equality, because w is one number"
             return f"{smallest}; {why}" if self.step >= 0 else why
         return smallest if self.step >= 0 else "nothing disturbed the run"
@@ -372,7 +372,7 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
 
 def _chance(log: Log, gamma: Gamma, ledger: Account | None, energy: float | None) -> Chance | None:
     """What single runs keep; None where this is none of them, with faults or with errors that are not known."""
-    if energy is None or ledger is None or not ledger.is_plain:
+    if energy is None or ledger is None or not ledger.is_without_faults:
         return None
     return chance(log.gains, steps=log.steps, energy=energy)
 

@@ -126,13 +126,15 @@ class Path(NamedTuple):
     error: Array  # (steps,): |z_tilde(k)|, as logged; nan where a message is missing
     bound: Array  # (steps,): gamma_path(k) sqrt(energy of the steps before), and |M eta(k)| without w
     rounding: Array  # (steps,): a relative rounding error of t in every step moves the error by t times this
+    start: Array | float = 0.0  # (steps,): |M eta(k)| without w; where the bound is no more, it is an equality
 
 
 def path_block(central: Central, block: FreeBlock, errors: Array, energy_before: Array) -> Path:
     """`errors` (all steps) are |z_tilde(k)|; `energy_before` (all steps) is the sum over j < k of |w(j)|^2."""
     steps = slice(block.first, block.first + len(block.eta))
     rounding = np.linalg.norm(block.reach @ np.abs(central.model.M).T, axis=1)
-    return Path(block.first, errors[steps], block.path * np.sqrt(energy_before[steps]) + block.start, rounding)
+    bound = block.path * np.sqrt(energy_before[steps]) + block.start
+    return Path(block.first, errors[steps], bound, rounding, block.start)
 
 
 def _magnitudes(log: Log, central: Central, inputs: Inputs, x: Array, eta: Array, first: int) -> Array:

@@ -82,7 +82,7 @@ class Account:
     @property
     def is_as_promised(self) -> bool:
         """Whether nothing happened in this run that gamma does not cover."""
-        return self.verdict.ledger is None or self.verdict.ledger.is_plain
+        return self.verdict.ledger is None or self.verdict.ledger.is_without_faults
 
     @cached_property
     def mean_bound(self) -> Array | None:

@@ -45,6 +45,9 @@ def test_no_more_runs_exceed_it_than_may(gains: Gains) -> None:
 
 
 def test_replay_says_it_of_a_run_that_is_as_the_model(gains: Gains, tmp_path: Path) -> None:
+    """Also while what the start leaves is still owed, as it is at first."""
+    short = replay(record(tmp_path / "short.mcap", gains, simulate(gains, steps=3), steps=3))
+    assert short.chance == chance(gains, steps=3, energy=0.0)
     verdict = replay(record(tmp_path / "run.mcap", gains, simulate(gains, steps=STEPS), steps=STEPS))
     assert verdict.chance == chance(gains, steps=STEPS, energy=0.0)
     assert verdict.chance is not None

@@ -130,7 +130,7 @@ def test_the_margin_is_of_the_bound_alone() -> None:
 
 
 def test_what_an_initial_error_leaves_stands_beside_the_bound(tmp_path: Path) -> None:
-    """At step 0 it is all there is, so that is in no margin; step 1 is none of those that say nothing."""
+    """Until the first w it is all there is, which is in no margin; step 1 is none of those that say nothing."""
     gains = cancelling(0.5)
     begun = gains.problem.with_(plant={"initial_error": [1.0, -1.0]})
     verdict = replayed(tmp_path, uncertified(begun, gains.K, gains.H, method="none"), 20)
@@ -140,3 +140,7 @@ def test_what_an_initial_error_leaves_stands_beside_the_bound(tmp_path: Path) ->
     assert "at step 0" not in note
     assert verdict.path_margin is not None
     assert verdict.path_margin > -1e-12
+    quiet = uncertified(begun.with_(disturbance={"kind": "none"}), gains.K, gains.H, method="none")
+    (tmp_path / "run.mcap").unlink()
+    verdict = replayed(tmp_path, quiet, 20)
+    assert (outcome(verdict, 5), verdict.path_margin) == (True, None)
