@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import json
+import random
 import runpy
+from fractions import Fraction
+from operator import mul
 from pathlib import Path
 
 import pytest
@@ -14,6 +17,7 @@ from agent.contract.gains import Gains
 from designer.proof.certificate import verify
 
 CHECKER = ROOT / "tools" / "check_certificate.py"
+ELIMINATED = runpy.run_path(str(CHECKER))["eliminated"]
 CORRECT, INCORRECT = (
     sorted((ROOT / "tools" / "certificates" / kind).glob("*.json")) for kind in ("correct", "incorrect")
 )
@@ -94,6 +98,37 @@ def test_what_cannot_be_read_is_undecided(old: str, new: str, check, tmp_path: P
     assert (code, said.split(":")[0]) == (UNDECIDED, "undecided")
 
 
+def test_no_gamma_is_negative(check, tmp_path: Path) -> None:
+    """Nor is its square what is meant."""
+    path = next(path for path in CORRECT if path.stem == "paper-exact")
+    for gamma in (0.0, -Gains.load(path).certificate.gamma):
+        assert check(edited(path, tmp_path / "negative.json", gamma=gamma))[0] == DISPROVED
+
+
+def test_what_is_left_is_rounded_to_the_side_that_is_asked_for() -> None:
+    """Of small integers, where rounding is all that counts: against fractions."""
+    rng = random.Random(0)
+    for order in (2, 3, 4) * 40:
+        A = [[rng.randint(-4, 4) for _ in range(order)] for _ in range(order)]
+        full = [[sum(map(mul, a, b)) + (2 if i == j else 0) for j, b in enumerate(A)] for i, a in enumerate(A)]
+        exact = Fraction(full[-1][-1]) - _taken(full)
+        rows = [row[i:] for i, row in enumerate(full)]
+        (above, _), (below, _) = (ELIMINATED(rows, order - 1, up) for up in (1, -1))
+        assert above is None or above[0][0] >= exact
+        assert below is None or below[0][0] <= exact
+
+
+def _taken(full: list[list[int]]) -> Fraction:
+    """By what the last entry falls as all before it are eliminated."""
+    X = [[Fraction(a) for a in row] for row in full]
+    last = X[-1][-1]
+    for k in range(len(X) - 1):
+        for i in range(k + 1, len(X)):
+            factor = X[i][k] / X[k][k]
+            X[i] = [a - factor * b for a, b in zip(X[i], X[k], strict=True)]
+    return last - X[-1][-1]
+
+
 def test_no_probability_is_above_1(check, tmp_path: Path) -> None:
     """What is negative of a variance would make up for anything."""
     assert check(_of_the_first_node(tmp_path, "arrival_probability", 1.5))[0] == UNDECIDED
@@ -127,18 +162,19 @@ def test_the_own_gain_of_an_unbiased_node_is_the_exact_one(check, tmp_path: Path
 
 
 BROKEN = {  # a line of the checker, what is wrong with it, and a file on which it then errs
-    "nothing is left to chance": ("return more | {", "return {", "beta-hidden"),
-    "links are not": ("if 0 < p < 1}", 'if 0 < p < 1 and name[0] == "theta"}', "rho"),
+    "nothing is left to chance": ("if 0 < p < 1} |", "if p is form} |", "beta-hidden"),
+    "links are not": ("if 0 < p < 1} |", 'if 0 < p < 1 and name[0] == "theta"} |', "rho"),
     "all is delivered": ("rho.get((names[i], names[j]), Q(1))", "Q(1)", "Pi-links"),
     "seen is hidden": ("if seen[j] else total", "if not seen[j] else total", "beta-seen"),
     "all count alike": ('v.get("weight", Q(1))', "Q(1)", "weighted"),
     "x is left out": ('0 if p.get("unbiased") and', "0 if", "gamma-links"),
     "no weights": ("scaled(K_i[names[j]], a[j])", "K_i[names[j]]", "unbiased"),
     "modes as likely": ("a / sum(row) for a in row", "Q(1, len(Pi)) for a in row", "paper-exact"),
-    "(17) holds": ("less(blocks(eye(nw), P_s), S(P, s))", "eye(1)", "H-theorem2"),
-    "(18) holds": ("less(P_s, scaled(MM, 1 / gamma**2))", "P_s", "gamma-beside"),
-    "any end is one": ("above(gP, Y))[0]", "True)[0]", "D"),
-    "twice g": ("eye(nw, g), zeros", "eye(nw, 2 * g), zeros", "H"),
+    "(17) holds": ("over(X, gP, k, 1), over(X, gP, k, -1)", "[[1]], [[1]]", "H-theorem2"),
+    "(18) holds": ("less(scaled(X, t), scaled(MM, g))", "X", "gamma-beside"),
+    "any end is one": ("proved(map(less, gP, Y))", "True", "D"),
+    "twice g": ("[[g] + [0]", "[[2 * g] + [0]", "H"),
+    "a mode is left out": ("zip(Y, Pi[s], strict=True)", "zip(Y, [1 - Pi[s][0], *Pi[s][1:]])", "Pi"),
     "all pivots are positive": ("if pivot <= 0", "if pivot == 0", "gamma"),
 }
 
@@ -158,5 +194,5 @@ def test_it_is_short_and_by_itself() -> None:
     text = CHECKER.read_text()
     imported = {name.name for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import) for name in node.names}
     imported |= {node.module for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)}
-    assert imported == {"json", "sys", "fractions", "math"}
+    assert imported == {"json", "sys", "fractions", "math", "operator"}
     assert len(text.splitlines()) <= 120

@@ -1,14 +1,15 @@
-"""Decides whether the gamma of a gains file is proved: exact fractions, no solver, nothing but the standard library.
+"""Decides whether the gamma of a gains file is proved: exact integers, no solver, nothing but the standard library.
 
 python check_certificate.py GAINS.json: proved (exit code 0), disproved, with a vector (1), or undecided (3)
 Every float is the fraction that it is; digest, lower ends and words are not looked at. Equations are those of Zhu, Wen,
-Peng, Yang, Control and Decision 35(8), 2020; sections those of docs/theory.md, which derives all that is used here.
-Vectors are [w; eta], eta = [x; e_1; ...; e_n]; without x where gains are unbiased and no loss is hidden (section 9).
+Peng, Yang, Control and Decision 35(8), 2020; sections those of docs/theory.md. Vectors are [w; eta], eta = [x; e_1; ...
+e_n]; without x where gains are unbiased and no loss is hidden (section 9).
 """
 import json, sys
 from fractions import Fraction as Q
 from math import lcm, prod
-BITS, STEPS, ORDER = 96, 2000, 50  # of a rounded number; of a recursion; the longest [w; eta] that is tried
+from operator import mul
+SPARE, STEPS, ORDER = 100, 2000, 60  # binary places beyond those of the file; steps; the longest [w; eta] that is tried
 KEYS = "name plant node arrival_probability loss weight link topology markov unbiased disturbance tolerance uncertainty"
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
@@ -17,19 +18,11 @@ turned = lambda X: [list(column) for column in zip(*X)]
 scaled = lambda X, by: [[by * a for a in row] for row in X]
 added = lambda *Xs: [[sum(entries) for entries in zip(*rows, strict=True)] for rows in zip(*Xs, strict=True)]
 less = lambda X, Y: added(X, scaled(Y, -1))
+times = lambda X, Y: [[sum(a * b for a, b in zip(row, col, strict=True) if a and b) for col in zip(*Y)] for row in X]
 total = lambda *forms: {key: added(*(f[key] for f in forms if key in f)) for key in {k: 0 for f in forms for k in f}}
 applied = lambda G, form: {key: times(G, X) for key, X in form.items()}
-above = lambda Xs, Ys: all(eliminated(X, len(X))[1] is None for X in map(less, Xs, Ys))  # as matrices, each pair
-def blocks(*Xs):  # square ones, along the diagonal
-    before = [sum(map(len, Xs[:k])) for k in range(len(Xs) + 1)]
-    return [[Q(0)] * b + row + [Q(0)] * (before[-1] - b - len(X)) for b, X in zip(before, Xs) for row in X]
-def times(X, Y):  # as integers over common denominators
-    c, d = (lcm(*(a.denominator for row in Z for a in row)) for Z in (X, Y))
-    columns, rows = turned([[int(a * d) for a in row] for row in Y]), [[int(a * c) for a in row] for row in X]
-    return [[Q(sum(a * b for a, b in zip(row, col, strict=True) if a), c * d) for col in columns] for row in rows]
 def chance(name, p, form):  # 1 with probability p, else 0, times a form: p and the deviation from it
-    more = {key | {(*name, p)}: X for key, X in form.items() if 0 < p < 1}
-    return more | {key: scaled(X, p) for key, X in form.items()}
+    return {key | {(*name, p)}: X for key, X in form.items() if 0 < p < 1} | {k: scaled(X, p) for k, X in form.items()}
 def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for every mode; M'M; Pi; lengths of w and x
     (A, B, M), nodes, modes, nu = (p["plant"][letter] for letter in "ABM"), p["node"], [], []
     assert {*p, *p["plant"], *sum(map(list, nodes), [])} <= {*KEYS.split(), *"ABCDM"}, f"it says more than {KEYS}"
@@ -59,56 +52,63 @@ def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for 
         modes.append([(prod(q * (1 - q) for *_, q in key), V[key]) for key in V])  # the variance of 0 or 1 is p (1 - p)
     z = [row[nw:] for v, x_i in zip(nodes, x_hat) for row in scaled(times(M, less(x, x_i)), v.get("weight", Q(1)))]
     return modes, times(turned(z), z), [[a / sum(row) for a in row] for row in Pi], nw, n_x
-def eliminated(X, count):  # what is left of symmetric X, None: all pivots were > 0; or None, v with v'Xv <= 0, v not 0
+# From here on matrices are symmetric: their rows, each from the diagonal on, of integers in units of 1 / one.
+common = lambda *Xs: lcm(*(a.denominator for X in Xs for row in X for a in row))
+raised = lambda X, by: [[row[0] + by, *row[1:]] for row in X]  # by >= row sums of |E|: not below X + E; -by: not above
+proved = lambda Xs: all(eliminated(X, len(X), -1)[1] is None for X in Xs)  # X > 0
+blocks = lambda *Xs: [row[i:] + [0] * sum(map(len, Xs[k:])) for k, X in enumerate(Xs, 1) for i, row in enumerate(X)]
+def eliminated(X, count, up):  # what is left of X, rounded up (1) or down (-1), None: all pivots were > 0; or None, v
     if not count: return X, None
     pivot, *row = X[0]
-    if pivot <= 0: return None, [Q(1)] + [Q(0)] * len(row)
-    rest = [[a - r[0] * b / pivot for a, b in zip(r[1:], row)] if r[0] else r[1:] for r in X[1:]]
-    left, v = eliminated(rest, count - 1)
-    return left, v and [-sum(a * b for a, b in zip(row, v)) / pivot, *v]
-def rounded(Y, up):  # short fractions; as a matrix not below Y (up = 1), or not above (-1): row sums of what is lost
-    grid = [Q(2) ** ((row[i].numerator.bit_length() - row[i].denominator.bit_length()) // 2) for i, row in enumerate(Y)]
-    Z = [[Q(round(a / (c * d) * 2**BITS), 2**BITS) * c * d for a, d in zip(row, grid)] for row, c in zip(Y, grid)]
-    return added(Z, blocks(*([[up * c**2 * Q(len(Y), 2**BITS) * any(row)]] for c, row in zip(grid, Y))))
+    if pivot <= 0: return None, [Q(1)] + [Q(0)] * len(row)  # v'Xv <= 0; so it was before, if rounded up since
+    rest = [[a - b * c // pivot for a, c in zip(X_i, row[i:])] for i, (b, X_i) in enumerate(zip(row, X[1:]))]
+    left, v = eliminated(raised(rest, up * len(row)), count - 1, up)
+    return left, v and [-sum(map(mul, row, v)) / pivot, *v]
+def told(what, X, unit, v):  # the exit code, by v as it is printed
+    v = [Q(float(a / max(map(abs, v)))) for a in v or eye(len(X))[0]]
+    at = sum(a * v[i] * v[i + j] * (2 if j else 1) for i, row in enumerate(X) for j, a in enumerate(row)) / unit
+    return (1 if at <= 0 else 3), f"{what}: v'Xv = {float(at):.3g} for v = {[*map(float, v)]}"
 def decide(file):  # the exit code, and in words what of the file is proved or false
     (modes, MM, Pi, nw, n_x), claim = model(file["problem"], file["K"], file["H"]), file["certificate"]
     names, nodes = ([part["name"] for part in file["problem"][kind]] for kind in ("topology", "node"))
-    every, size, g, form = range(len(modes)), len(MM), claim["gamma"] ** 2, claim["form"]
-    def S(Y, s):  # E eta(k+1)'Y(t)eta(k+1), t the mode after s, as a quadratic form in [w; eta]
-        Y_bar = added(*(scaled(Y_t, pi) for Y_t, pi in zip(Y, Pi[s], strict=True)))
-        return added(*(scaled(times(turned(V), times(Y_bar, V)), variance) for variance, V in modes[s]))
-    def backwards(Y, U, up, done):  # section 2, rounded, U added at every step: True, Y where it is done; False, why
+    size, form, gamma, lyapunov = len(MM), claim["form"], claim["gamma"], claim["kind"] == "lyapunov"
+    theorem1 = {gamma if lyapunov else None, claim.get("theorem1_gamma")} - {None}  # each by (17) and (18)
+    stored = [[claim["P"][s]] if form == "full" else [*[claim.get("R")][:n_x], *(claim["Q"][s][i] for i in nodes)]
+        for s in names if form != "summed" or theorem1]  # of every P the blocks
+    gP = [blocks(*(scaled(added(X, turned(X)), gamma**2 / 2) for X in Xs)) for Xs in stored]
+    numbers = [[max(t, 0) ** 2 for t in (gamma, *theorem1)]], blocks(MM), blocks(zeros(size, size)), *gP
+    one, fine = common(*numbers) << SPARE, common(*(V for terms in modes for _, V in terms))
+    [[g, *squares]], MM, none, *gP = ([[int(a * one) for a in row] for row in X] for X in numbers)
+    one_p, one_Pi = common(*([[p] for p, _ in terms] for terms in modes)), common(Pi)
+    modes = [[(int(p * one_p), [i for i, row in enumerate(V) if any(row)], [[int(a * fine) for a in v] for v in zip(
+        *filter(any, V))]) for p, V in terms if any(map(any, V))] for terms in modes]  # rows that are not 0, by columns
+    def over(X, Y, s, up):  # diag{g I, X} - S(Y)(s), S = E eta(k+1)'Y(t)eta(k+1), t the mode after s; S is rounded up
+        left = scaled([[g] + [0] * (nw - i - 1 + size) for i in range(nw)] + X, fine**2 * one_p)
+        Y_bar = added(*(scaled(Y_t, int(pi * one_Pi)) for Y_t, pi in zip(Y, Pi[s], strict=True)))
+        Y_bar = raised([[a // one_Pi for a in row] for row in Y_bar], up * size)
+        for p, rows, V in modes[s]:
+            Y_here = [[Y_bar[min(i, j)][abs(i - j)] for j in rows] for i in rows]
+            YV = [[sum(map(mul, row, v)) for row in Y_here] for v in V]
+            left = [[a - p * sum(map(mul, u, v)) for a, v in zip(r, V[c:])] for c, (r, u) in enumerate(zip(left, YV))]
+        return raised([[a // (fine**2 * one_p) for a in row] for row in left], -up * (nw + size))
+    def backwards(X, U, up, done):  # section 2 from X on, rounded, plus U at every step: Y where it is done; or why not
+        Y = [X] * len(modes)
         for k in range(1, STEPS):
-            W = [less(blocks(eye(nw, g), zeros(size, size)), rounded(S(Y, s), up)) for s in every]
-            left = [eliminated(W_s, nw) for W_s in W]
-            for s in (s for s in every if left[s][1]):
-                return False, (f"W > 0 at step {k}", s, [row[:nw] for row in W[s][:nw]], left[s][1][:nw])
-            F = [rounded(scaled(rest, -1), up) for rest, _ in left]
-            if k % (1 + k // 8) == 0 and done(Y, F): return True, Y
+            left = [eliminated(over(none, Y, s, up), nw, -up) for s in range(len(modes))]
+            for s, (_, v) in enumerate(left):
+                if v: return None, told(f"W > 0 in mode {names[s]} at step {k}", over(none, Y, s, up), one, v)
+            F = [scaled(rest, -1) for rest, _ in left]
+            if k % (1 << k.bit_length() // 2) == 0 and done(Y, F): return Y, None
             Y = [added(F_s, U) for F_s in F]
-        return None, f"the recursion does not end in {STEPS} steps"
-    def summed(k):  # where P is not stored: Y / g for a Y that is above what a step makes of it
-        U = eye(size, g / 64**k)
-        holds, Y = backwards([U] * len(modes), U, 1, above)
-        return [scaled(Y_s, 1 / g) for Y_s in Y] if holds else None
-    def stored(s):
-        P_s = claim["P"][s] if form == "full" else blocks(*[claim.get("R")][:n_x], *(claim["Q"][s][i] for i in nodes))
-        return scaled(added(P_s, turned(P_s)), Q(1, 2))
-    P = next(filter(None, map(summed, range(20))), []) if form == "summed" else [*map(stored, names)]
-    checks = [("(17)", s, less(blocks(eye(nw), P_s), S(P, s))) for s, P_s in enumerate(P)]
-    for gamma in {claim["gamma"] if claim["kind"] == "lyapunov" else None, claim.get("theorem1_gamma")} - {None}:
-        checks += [("(18)", s, less(P_s, scaled(MM, 1 / gamma**2))) for s, P_s in enumerate(P)]
-    false = [(what, s, X, v) for what, s, X in checks if (v := eliminated(X, len(X))[1])]
-    def told(what, s, X, v):
-        v = [Q(float(a / max(map(abs, v)))) for a in v]  # as it is printed
-        at = times(times([v], X), turned([v]))[0][0]
-        return (1 if at <= 0 else 3), f"{what} in mode {names[s]}: v'Xv = {float(at):.3g} for v = {[*map(float, v)]}"
-    if false and form != "summed": return told(*false[0])  # of a P that is not in the file nobody claims anything
-    start, none, gP = [MM] * len(modes), zeros(size, size), [scaled(P_s, g) for P_s in P]
-    if P and not false and (claim["kind"] == "lyapunov" or backwards(start, none, 1, lambda Y, _: above(gP, Y))[0]):
-        return 0, f"gamma = {float(claim['gamma'])}"
-    holds, why = backwards(start, none, -1, lambda *_: False)
-    return told(*why) if holds is False else (3, why)
+        return None, (3, f"the recursion does not end in {STEPS} steps")
+    for k, (s, X) in enumerate(zip(names, gP)):
+        both = [("(18)", left, left, g * t) for t in squares for left in [less(scaled(X, t), scaled(MM, g))]]
+        for what, low, high, unit in [("(17)", over(X, gP, k, 1), over(X, gP, k, -1), g), *both]:
+            if not proved([low]): return told(f"{what} in mode {s}", high, unit, eliminated(high, len(high), 1)[1])
+    units = (blocks(eye(size, g >> bits)) for bits in range(12, 100, 12))
+    gP = gP or next(filter(None, (backwards(U, U, 1, lambda Y, F: proved(map(less, Y, F)))[0] for U in units)), [])
+    good = lyapunov or (gP and backwards(MM, none, 1, lambda Y, _: proved(map(less, gP, Y)))[0])
+    return (0, f"gamma = {float(claim['gamma'])}") if good else backwards(MM, none, -1, lambda *_: False)[1]
 if __name__ == "__main__":
     try:
         with open(sys.argv[1]) as gains:

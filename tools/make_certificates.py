@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
-from networks import random_problem, real_networks  # noqa: E402
+from networks import random_problem, real_network, real_networks  # noqa: E402
 
 from agent.contract.errors import InputError  # noqa: E402
 from agent.contract.gains import Gains  # noqa: E402
@@ -69,6 +69,7 @@ def designed() -> dict[str, Document]:
         "paper-exact": design(paper, method="exact", budget=BUDGET),
         "paper-two-states": design(random_problem(5, n=2, nx=2), method="exact", budget=BUDGET),
         "paper-theorem2": design(paper, method="theorem2"),
+        "slow": design(real_network(random_problem(5, n=2, nx=2), radius=0.98), method="least-variance"),
         "two-outputs-theorem2": design(random_problem(5, n=2, nx=2, nz=2), method="theorem2"),
     }
     for kind, problem in real.items():
