@@ -25,17 +25,12 @@ from agent.contract.arrays import Array
 Map = Callable[[Array], Array]
 
 _TERMS = 300  # that are added one by one, which rounds least; what decays more slowly is solved for
-_DENSE = 1000  # unknowns up to which L is written out as a matrix
+DENSE = 1000  # unknowns up to which L is written out as a matrix
 _FEW = 40  # and up to which its eigenvalues take no time
 _ROUGH = 1e-4, 10  # tolerance and restarts of Arnoldi's method beyond twice as many: a product takes up to 0.1 s
 _TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to rounding, and Arnoldi's method most of all
 _STEPS = 30  # in which it is looked for
 _HUGE = 1e150
-_STRICT = 1e-3  # by this part of itself P stands below the largest multiple that satisfies (17)
-_STRICT_WHERE_SLOW = 1e-6
-_SLOW = 0.98  # radius from which on one P would end the recursion late
-_ROUNDS = 8
-_FLOOR = 1e-6  # of I that is in every U, so that P > 0
 _EXACT = 1e-12
 _REST = 0.25  # what is left of U may be off by, measured by U
 
@@ -88,52 +83,6 @@ def is_positive(Z: Array) -> bool:
     return True
 
 
-def invariants(S: Map, found: Decay, units: Array, peak: Array) -> list[Array]:
-    """Every P here satisfies (17) strictly, as far as floats tell; none: `found` has no Z > 0.
-
-    S(Y) is (modes, n + nw, n + nw), L its corner, peak M'M. The first P is of Z. Where errors decay slowly there are
-    two more, of other U: M'M, which suits errors that all move alike; and A'P_bar B W^-1 B'P_bar A, what the worst w
-    adds, taken again and again, until P is as large as can be in the direction that lasts.
-    """
-    if found.total is None or found.rest is None or not found.dies_out:
-        return []
-    modes, n = found.total.shape[:2]
-    first, order = scaled(S, found.total, found.rest), modes * n * (n + 1) // 2
-    if order > _DENSE or found.radius < _SLOW:
-        return [first]
-    both, eye = np.outer(units, units), np.broadcast_to(np.diag(units**2), first.shape)
-    pack, unpack = _packing(modes, n)
-    I_L = np.eye(order) - _matrix(lambda Y: S(Y * both)[:, :n, :n] / both, modes, n)
-    inverse = np.linalg.inv(I_L)
-
-    def of(U: Array, share: float) -> Array | None:
-        U = U + share * float((U.diagonal(axis1=1, axis2=2) / units**2).max()) * eye
-        Z = unpack(inverse @ pack(U / both)) * both
-        rest = Z - S(Z)[:, :n, :n]
-        return scaled(S, Z, rest, _STRICT_WHERE_SLOW) if is_positive(Z) and is_positive(rest) else None
-
-    P, worst = first, [of(peak, _FLOOR)]
-    for k in range(2, 2 + _ROUNDS):
-        grown = S(P)
-        AB, W = grown[:, :n, n:], np.eye(grown.shape[1] - n) - grown[:, n:, n:]
-        following = of(AB @ np.linalg.solve(W, AB.swapaxes(1, 2)), max(10.0**-k, _FLOOR))
-        if following is None:
-            break
-        P = following
-    return [first, *(P for P in (*worst, P) if P is not None)]
-
-
-def scaled(S: Map, Z: Array, rest: Array, strict: float = _STRICT) -> Array:
-    """c Z with the largest c that (17) allows, less a part of it; rest = Z - L(Z) > 0.
-
-    By Schur's complement I > c (B'Z_bar B + B'Z_bar A rest^-1 A'Z_bar B).
-    """
-    grown, n = S(Z), Z.shape[1]
-    AB, BB = grown[:, :n, n:], grown[:, n:, n:]
-    worst = float(np.linalg.eigvalsh(BB + AB.swapaxes(1, 2) @ np.linalg.solve(rest, AB)).max())
-    return np.asarray(Z / (worst * (1.0 + strict)) if worst > 0.0 else Z)
-
-
 def _total(L: Map, modes: int, n: int) -> tuple[Array | None, Array | None]:
     """Z and Z - L(Z) for U = I, which is in the middle of what is allowed for."""
     eye = np.broadcast_to(np.eye(n), (modes, n, n))
@@ -159,9 +108,9 @@ def solution(L: Map, right: Array, *, enough: float = _EXACT) -> Array | None:
     None where there is none, or it is not found.
     """
     modes, n = right.shape[:2]
-    pack, unpack = _packing(modes, n)
+    pack, unpack = packing(modes, n)
     b, order = pack(right), modes * n * (n + 1) // 2
-    if order <= _DENSE:
+    if order <= DENSE:
         I_L = np.eye(order) - _matrix(L, modes, n)
         if not np.isfinite(I_L).all():
             return None
@@ -175,45 +124,6 @@ def solution(L: Map, right: Array, *, enough: float = _EXACT) -> Array | None:
     I_L = LinearOperator((order, order), matvec=lambda x: x - pack(L(unpack(x))), dtype=np.float64)
     x, _ = gmres(I_L, b, rtol=enough, restart=60, maxiter=5)
     return unpack(x)
-
-
-def lasting(L: Map, first: Array) -> tuple[Array, float] | None:
-    """X >= 0 with L(X) = lambda X for the largest lambda in what L makes of `first`, and lambda; None: not found."""
-    pack, unpack = _packing(*first.shape[:2])
-    start = pack(first)
-    if not start.any():
-        return None
-    if len(start) <= (_FEW if find_spec("scipy") else _DENSE):
-        # in what L makes of `first` alone: other directions are left out
-        basis = _krylov(lambda y: pack(L(unpack(y))), start)
-        values, vectors = np.linalg.eig(np.array([basis.T @ pack(L(unpack(y))) for y in basis.T]).T)
-        k = int(np.real(values).argmax())
-        X = unpack(basis @ np.real(vectors[:, k]))
-        return (X if np.trace(X, axis1=1, axis2=2).sum() > 0.0 else -X), float(np.real(values[k]))
-    from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
-
-    operator = LinearOperator((len(start), len(start)), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
-    try:
-        values, vectors = eigs(operator, k=1, v0=start, which="LR", tol=1e-12, maxiter=100)
-    except ArpackError:
-        return None
-    X = unpack(np.real(vectors[:, 0]))
-    X = X if np.trace(X, axis1=1, axis2=2).sum() > 0.0 else -X
-    return X, float(np.real(values[0]))
-
-
-def _krylov(L: Map, y: Array) -> Array:
-    """An orthonormal basis of y, L(y), L(L(y)), ..., in columns."""
-    basis = (y / np.linalg.norm(y))[:, None]
-    while basis.shape[1] < len(y):
-        following = L(basis[:, -1])
-        size = np.linalg.norm(following)
-        for _ in range(2):
-            following = following - basis @ (basis.T @ following)
-        if not np.linalg.norm(following) > 1e-9 * size:
-            break
-        basis = np.hstack([basis, (following / np.linalg.norm(following))[:, None]])
-    return basis
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -243,7 +153,7 @@ def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None 
 
 
 def _radius(L: Map, modes: int, n: int) -> float:
-    pack, unpack = _packing(modes, n)
+    pack, unpack = packing(modes, n)
     order = modes * n * (n + 1) // 2
     first = pack(L(np.broadcast_to(np.eye(n), (modes, n, n))))
     if not np.isfinite(first).all():
@@ -252,7 +162,7 @@ def _radius(L: Map, modes: int, n: int) -> float:
         from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 
         operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
-        tol, restarts = (1e-10, 60) if order <= 2 * _DENSE else _ROUGH
+        tol, restarts = (1e-10, 60) if order <= 2 * DENSE else _ROUGH
         try:
             found = eigs(operator, k=1, v0=first + 1e-30, tol=tol, maxiter=restarts, return_eigenvectors=False)
             radius = float(np.abs(found).max())
@@ -260,7 +170,7 @@ def _radius(L: Map, modes: int, n: int) -> float:
                 return radius
         except ArpackError:
             pass
-    if order > 2 * _DENSE:
+    if order > 2 * DENSE:
         return _rate(L, unpack(first))
     M = _matrix(L, modes, n)
     return float(np.abs(np.linalg.eigvals(M)).max()) if np.isfinite(M).all() else np.inf
@@ -293,13 +203,13 @@ def _rate(L: Map, Y: Array) -> float:
     return float(np.exp((logs[-1] - logs[half]) / (len(logs) - 1 - half)))
 
 
-def _packing(modes: int, n: int) -> tuple[Map, Map]:
-    """From symmetric matrices to vectors, in which they have the same norm, and back."""
+def packing(modes: int, n: int) -> tuple[Map, Map]:
+    """From symmetric matrices (..., modes, n, n) to vectors, in which they have the same norm, and from one back."""
     rows, columns = np.triu_indices(n)
     weights = np.where(rows == columns, 1.0, np.sqrt(2.0))
 
     def pack(Y: Array) -> Array:
-        return np.asarray((Y[:, rows, columns] * weights).reshape(-1))
+        return np.asarray((Y[..., rows, columns] * weights).reshape(*Y.shape[:-3], -1))
 
     def unpack(y: Array) -> Array:
         Y = np.empty((modes, n, n))
@@ -311,6 +221,6 @@ def _packing(modes: int, n: int) -> tuple[Map, Map]:
 
 def _matrix(L: Map, modes: int, n: int) -> Array:
     """L in these vectors, (order, order)."""
-    pack, unpack = _packing(modes, n)
+    pack, unpack = packing(modes, n)
     order = modes * n * (n + 1) // 2
     return np.array([pack(L(unpack(unit))) for unit in np.eye(order)]).T

@@ -50,9 +50,10 @@ ROOMS = {
     # the mathematics
     "designer.coordinates": "",
     "designer.decay": "",
+    "designer.invariants": "designer.decay",
     "designer.model": "designer.coordinates",
-    "designer.gain": "designer.coordinates designer.decay designer.model",
-    "designer.proof": "designer.coordinates designer.decay",
+    "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model",
+    "designer.proof": "designer.coordinates designer.decay designer.invariants",
     "designer.lmi": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.workers": "",
     "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
@@ -63,8 +64,8 @@ ROOMS = {
     "designer.single_run": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
-    "designer.box": "designer.coordinates designer.decay designer.gain designer.ladder designer.model designer.proof "
-    "designer.search",
+    "designer.box": "designer.coordinates designer.decay designer.gain designer.invariants designer.ladder "
+    "designer.model designer.proof designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
     "designer.model designer.proof designer.search",
     "designer.stacked": "designer.model",

@@ -12,9 +12,10 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, corners
 from designer.box.worst import There, Worst, worst
-from designer.decay import decay, is_positive, scaled
+from designer.decay import decay, is_positive
 from designer.gain.exact import Operator, exact_gain
 from designer.gain.sensitivity import sweep
+from designer.invariants import scaled
 from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import Truth, told
 from designer.proof.by_vertices import ByVertices, prove, upper_bound

@@ -9,14 +9,15 @@ In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.j
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.decay import Decay, decay, invariants, lasting, scaled
+from designer.decay import Decay, decay
 from designer.gain.products import Collected, Pattern, Products
+from designer.invariants import Threshold, invariants, scaled
 from designer.model.error_model import ErrorModel
 from designer.model.links import LinkTerms
 from designer.model.units import natural_scale
@@ -28,7 +29,6 @@ _WIDTH_OF_NODES = 1e-4
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
-_LASTS = 1e-7  # relative to what grows
 
 
 class Gain(NamedTuple):
@@ -175,8 +175,8 @@ class InvariantSet:
     a larger W. Of several P, each has its set.
     """
 
-    def __init__(self, *P: Array, escape: Escape | None = None) -> None:
-        self.P, self.escape = P, escape  # each (modes, n_eta, n_eta)
+    def __init__(self, *P: Array, thresholds: Sequence[Threshold] = ()) -> None:
+        self.P, self.thresholds = P, thresholds  # each P (modes, n_eta, n_eta)
 
     def contains(self, Y: Array, g: float) -> bool:
         """Cholesky decides."""
@@ -184,7 +184,7 @@ class InvariantSet:
 
     def never_reached(self, Y: Array, g: float) -> bool:
         """Whether it is known that the recursion fails sooner or later."""
-        return self.escape is not None and float(np.vdot(self.escape.X, Y)) > g * self.escape.level
+        return any(threshold.passed(Y, g) for threshold in self.thresholds)
 
 
 def _positive(Y: Array) -> bool:
@@ -192,46 +192,6 @@ def _positive(Y: Array) -> bool:
         return bool(np.isfinite(np.linalg.cholesky(Y)).all())
     except np.linalg.LinAlgError:
         return False
-
-
-class Escape(NamedTuple):
-    """What Y grows along for ever, once tr(XY) > g level: docs/theory.md, section 2.
-
-    A step leads to Y+ >= L_c(Y) - g Gamma'Gamma for any policy w = Gamma eta, L_c of the closed loop. With X that w can
-    bring about, and whose image one step later is lambda X, lambda > 1, tr(XY+) >= lambda tr(XY) - g tr(X Gamma'Gamma).
-    """
-
-    X: Array  # (modes, n_eta, n_eta)
-    level: float  # tr(X Gamma'Gamma) / (lambda - 1)
-
-
-def escape(operator: Operator, P: Array) -> Escape | None:
-    """For the policy that is worst against P, a P that is nearly the largest; None where nothing lasts under it."""
-    n, S = operator.size, operator.of(P)
-    Gamma = np.asarray(np.linalg.solve(operator.eye_w - S[:, n:, n:], S[:, n:, :n]), dtype=np.float64)
-
-    def carry(X: Array) -> Array:
-        return operator.carry(_joint(X, Gamma))
-
-    unit = np.zeros_like(S)
-    unit[:, n:, n:] = operator.eye_w
-    found = lasting(carry, operator.carry(unit))
-    if found is None or not found[1] > 1.0 + _LASTS:
-        return None
-    X, growth = found
-    if np.abs(carry(X) - growth * X).max() > _LASTS * (growth - 1.0) * np.abs(X).max():
-        return None
-    spent = float(np.vdot(X, Gamma.swapaxes(1, 2) @ Gamma))
-    return Escape(X, spent / (growth - 1.0) * (1.0 + _LASTS)) if spent > 0.0 else None
-
-
-def _joint(X: Array, Gamma: Array) -> Array:
-    """E[eta; w][eta; w]' for w = Gamma eta."""
-    GX = Gamma @ X
-    return np.concatenate(
-        [np.concatenate([X, GX.swapaxes(1, 2)], axis=2), np.concatenate([GX, GX @ Gamma.swapaxes(1, 2)], axis=2)],
-        axis=1,
-    )
 
 
 class Trial(NamedTuple):
@@ -280,11 +240,11 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
-    P = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
+    P, thresholds = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
     if not P:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
-    invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
+    invariant = InvariantSet(*P, thresholds=thresholds)
     if width is None:
         width = _WIDTH if model.size < _LARGE else _WIDTH_OF_LARGE
     found = _bracket(operator, _MOST_STEPS, invariant, width)
@@ -298,15 +258,11 @@ def node_gains(model: ErrorModel) -> list[tuple[float, float]] | None:
     M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable.
     """
     operator = Operator(model)
-    P = invariants(
-        operator.of,
-        decay(operator.corner, model.modes, operator.units, operator.model.moves),
-        operator.units,
-        operator.MM,
-    )
+    decays = decay(operator.corner, model.modes, operator.units, operator.model.moves)
+    P, thresholds = invariants(operator.of, decays, operator.units, operator.MM)
     if not P:
         return None
-    invariant = InvariantSet(*P, escape=escape(operator, P[-1]) if len(P) > 1 else None)
+    invariant = InvariantSet(*P, thresholds=thresholds)
     found = []
     for M in np.split(model.M, len(model.rows)):
         operator.MM = np.broadcast_to(M.T @ M, operator.MM.shape)

@@ -14,7 +14,7 @@ from agent.contract.problem import Problem
 from designer.proof import balls
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import UNDECIDED, Sign, above, below, blocks, diagonal, exact, identity, of_blocks, part, sign
-from designer.proof.held_policies import HeldPolicies
+from designer.proof.held_policies import Held, HeldPolicies
 
 
 class ByBalls:
@@ -30,6 +30,7 @@ class ByBalls:
             self.model = BallModel(problem, K, H, T=T)
         self.order = self.model.size
         self.unknowns = len(self.model.AB) * self.order * (self.order + 1) // 2  # entries of Y in all modes
+        self._last: tuple[Array, float, Held | None] | None = None
 
     def inequality_17(self, P: Array) -> list[Sign]:
         n, model = self.model.size, self.model
@@ -85,12 +86,23 @@ class ByBalls:
             return UNDECIDED, None
         return found, _rounded(grown, up=up)
 
-    def leap(self, Y: list[arb_mat], gamma: float, steps: int) -> list[arb_mat] | None:
+    def leap(self, Y: list[arb_mat], gamma: float, steps: int, like: Array | None = None) -> list[arb_mat] | None:
         with ctx.workprec(self.bits):
-            policies = [self._worst(S, gamma**2) for S in self.model.joint(Y)]
-            if not all(np.isfinite(Gamma).all() for Gamma in policies):
-                return None
-            return [below(Y_s) for Y_s in self._held.after(Y, [exact(Gamma) for Gamma in policies], gamma, steps)]
+            held = self._held_now(Y, gamma) if like is None else self._held_like(like, gamma)
+            return None if held is None else [below(Y_s) for Y_s in self._policies.after(Y, held, steps)]
+
+    def _held_like(self, P: Array, gamma: float) -> Held | None:
+        """What was asked for last is kept: its powers are most of the work."""
+        if self._last is None or self._last[0] is not P or self._last[1] != gamma:
+            self._last = P, gamma, self._held_now(symmetric(P), gamma, 1.0)
+        return self._last[2]
+
+    def _held_now(self, Y: list[arb_mat], gamma: float, g: float | None = None) -> Held | None:
+        """The policy that is worst against Y at g, or at gamma^2; None where it is no number."""
+        policies = [self._worst(S, gamma**2 if g is None else g) for S in self.model.joint(Y)]
+        if not all(np.isfinite(Gamma).all() for Gamma in policies):
+            return None
+        return self._policies.held([exact(Gamma) for Gamma in policies], gamma)
 
     def _worst(self, S: arb_mat, g: float) -> Array:
         """W^-1 B'Y_bar A in floats."""
@@ -102,7 +114,7 @@ class ByBalls:
                 return np.full((self.model.nw, n), np.nan)
 
     @cached_property
-    def _held(self) -> HeldPolicies:
+    def _policies(self) -> HeldPolicies:
         return HeldPolicies(self.model)
 
     def below(self, Y: list[arb_mat], P: Array, gamma: float) -> list[Sign]:

@@ -15,7 +15,8 @@ from flint import arb
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
-from designer.decay import Decay, decay, invariants
+from designer.decay import Decay, decay
+from designer.invariants import invariants
 from designer.proof.ball_model import BallModel
 from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 from designer.proof.sparse import matrix
@@ -97,7 +98,8 @@ class FloatModel:
     @np.errstate(all="ignore")
     def invariants(self) -> list[Array]:
         """Every P(s) for (17), (modes, n_eta, n_eta), found and not proved; none where the errors do not decay."""
-        return invariants(self.weigh, self.decay, weights(self._reach()), np.tile(self.peak.middle, (self.modes, 1, 1)))
+        peak = np.tile(self.peak.middle, (self.modes, 1, 1))
+        return invariants(self.weigh, self.decay, weights(self._reach()), peak).P
 
     def _reach(self) -> Array:
         """About the square of what w of energy 1 makes of each state of the plant, and of its errors, (n_eta,)."""

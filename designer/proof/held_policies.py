@@ -7,11 +7,30 @@ recursion lead to, unless one of these has a W that is not positive definite, wh
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from flint import arb, arb_mat
 
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import identity
+
+
+class Held(NamedTuple):
+    """A step with w held, and its powers of 2, 4, 8, ... as far as they were asked for."""
+
+    powers: list[arb_mat]
+
+    def moved(self, vector: arb_mat, steps: int) -> arb_mat:
+        """So many steps, a power of two; a power of the matrix is as dear as some multiplications by vectors."""
+        k = 0
+        while steps % 2 == 0 and steps > vector.nrows():
+            k, steps = k + 1, steps // 2
+            if k == len(self.powers):
+                self.powers.append(self.powers[-1] * self.powers[-1])
+        for _ in range(steps):
+            vector = self.powers[k] * vector
+        return vector
 
 
 class HeldPolicies:
@@ -24,15 +43,14 @@ class HeldPolicies:
             [model.weighed(s, _unit(model.size, *at), [model.eta]) for at in self._places] for s in model.modes
         ]
 
-    def after(self, Y: list[arb_mat], policies: list[arb_mat], gamma: float, steps: int) -> list[arb_mat]:
-        """Not above Y after so many steps of the recursion at gamma^2, a power of two, w = Gamma eta by mode."""
-        step = self._step(policies, arb(gamma) ** 2)
-        vector = arb_mat(step.nrows(), 1, [*(Y_s[at] for Y_s in Y for at in self._places), arb(1)])
-        while steps % 2 == 0 and steps > step.nrows():
-            step, steps = step * step, steps // 2
-        for _ in range(steps):
-            vector = step * vector
-        return self._matrices(vector)
+    def held(self, policies: list[arb_mat], gamma: float) -> Held:
+        """w = Gamma eta by mode, at gamma^2."""
+        return Held([self._step(policies, arb(gamma) ** 2)])
+
+    def after(self, Y: list[arb_mat], held: Held, steps: int) -> list[arb_mat]:
+        """Not above Y after so many steps of the recursion at gamma^2, a power of two."""
+        vector = arb_mat(held.powers[0].nrows(), 1, [*(Y_s[at] for Y_s in Y for at in self._places), arb(1)])
+        return self._matrices(held.moved(vector, steps))
 
     def _step(self, policies: list[arb_mat], g: arb) -> arb_mat:
         """Y <- L_c(Y) - g Gamma'Gamma, as a matrix."""

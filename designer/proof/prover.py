@@ -33,9 +33,10 @@ _STEPS_BEFORE_LEAPS = 1000
 _SLOW = 0.98  # radius
 _SHARES = (1 / 4, 1 / 32)  # of all steps so far that w = Gamma eta is held for
 _FORGOTTEN = 40.0  # e^-40 is left of what there was, after so many times the steps that errors last
+_BITS_OF_LEAPS = 512  # a vector that turns under 64 powers of a matrix loses some hundred
 _LARGEST_LEAP = 130  # entries of Y in all modes: a second, if its powers are taken some hundred times
 _LARGEST_LEAP_OFTEN = 60
-_STEPS_OF_OTHERS = 5000  # with a P that is to end it early
+_STEPS_OF_OTHERS = 20_000  # with a P that is to end it early
 
 
 class _Answer(NamedTuple):
@@ -137,14 +138,16 @@ class Prover:
 
     def at_least_by_leaps(self, gamma: float) -> str | None:
         """The same where errors decay slowly and are few, by a w = Gamma eta that is held."""
-        by = next((by for k in range(len(self._makes)) if isinstance(by := self._arithmetic(k), ByBalls)), None)
+        known = (self._arithmetic(k) for k in range(len(self._makes)))
+        by = next((by for by in known if isinstance(by, ByBalls) and by.bits >= _BITS_OF_LEAPS), None)
         radius = self._floats.model.decay.radius
         if by is None or by.unknowns > _LARGEST_LEAP or not _SLOW < radius < 1.0:
             return None
         most, modes = int(_FORGOTTEN / (1.0 - radius)), self._problem.mode_names
-        shares = _SHARES if by.unknowns <= _LARGEST_LEAP_OFTEN else _SHARES[:1]
-        known = (disproof_by_leaps(by, modes, gamma, most=most, share=share) for share in shares)
-        return by.name if any(false is not None for false in known) else None
+        ways: list[tuple[float, Array | None]] = [(1.0, P) for P in self._floats.model.invariants[2:]]
+        ways += [(share, None) for share in _SHARES] if by.unknowns <= _LARGEST_LEAP_OFTEN or not ways else []
+        false = (disproof_by_leaps(by, modes, gamma, most=most, share=share, P=P) for share, P in ways)
+        return by.name if any(finding is not None for finding in false) else None
 
     def at_least_by_steps(self, gamma: float, *, most: int) -> str | None:
         """The same, one step after the other; more than balls take are for floats alone."""

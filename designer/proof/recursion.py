@@ -23,6 +23,7 @@ Modes = tuple[str, ...]
 MOST_STEPS = 100_000  # designs need fewer even where errors hardly decay
 _FEWEST = 500  # that are taken in networks of any size
 _FIRST = 100  # steps before w = Gamma eta is held
+_FIRST_OF_THRESHOLD = 300  # in which what decays fast has died out
 MOST_NUMBERS = 8e9  # of all S(Y) together: about two minutes; at the exact gain itself a recursion has no end
 
 
@@ -109,22 +110,33 @@ def disproof(
 class Leaping(Arithmetic, Protocol):
     """One that takes many steps at once."""
 
-    def leap(self, Y: Any, gamma: float, steps: int) -> Any:
-        """Not above Y so many steps earlier, a power of two, w = Gamma eta held that is worst now; None: not found."""
+    def leap(self, Y: Any, gamma: float, steps: int, like: Array | None = None) -> Any:
+        """Not above Y so many steps earlier, a power of two, w = Gamma eta held that is worst now; None: not found.
+
+        `like`: Gamma is worst against this P at g = 1 instead.
+        """
 
 
-def disproof_by_leaps(by: Leaping, modes: Modes, gamma: float, *, most: int, share: float) -> Finding | None:
-    """As `disproof`, of errors that decay slowly: the worst w = Gamma eta hardly moves, and is held for ever longer."""
-    Y, done = by.start(up=False), 0
+def disproof_by_leaps(
+    by: Leaping, modes: Modes, gamma: float, *, most: int, share: float, P: Array | None = None
+) -> Finding | None:
+    """As `disproof`, of errors that decay slowly: one w = Gamma eta is held for so large a share of all steps before.
+
+    Without P it is the worst one, which hardly moves where errors do not oscillate. Where they do it turns with them,
+    but one that is worst against a P = F(P) is worst in every phase.
+    """
+    Y, done, leapt = by.start(up=False), 0, 0
+    first, between = (_FIRST, 1) if P is None else (_FIRST_OF_THRESHOLD, by.order)
     while done < most:
         signs, Y = by.step(Y, gamma, up=False)
         done += 1
         false = [finding for finding in found("recursion", modes, signs, _at(done, gamma)) if finding.sign.refuted]
         if false or Y is None:
             return false[0] if false else None
-        if done >= _FIRST:
+        if done >= max(first, leapt + between):
             length = 2 ** (int(share * done).bit_length() - 1)
-            Y, done = by.leap(Y, gamma, length), done + length
+            Y, done = by.leap(Y, gamma, length, P), done + length
+            leapt = done
             if Y is None:
                 return None
     return None

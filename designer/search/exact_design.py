@@ -34,8 +34,8 @@ _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
-_LEAPT = (1e-6, 3e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # below `high`, which takes little time; the last is tried first
-_FAR_BELOW = (1e-6, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if not far below
+_LEAPT = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # below either end, which takes little time; the last is tried first
+_FAR_BELOW = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if not far below
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
@@ -234,8 +234,10 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     if problem.n * problem.nx > _PROVED_STATES:
         return gain.low * (1.0 - _BELOW[3])
     prover, slow = Prover(problem, K, H), gain.radius > SLOW
-    if slow and prover.at_least_by_leaps(gain.high * (1.0 - _LEAPT[-1])):
-        return next(low for part in _LEAPT if prover.at_least_by_leaps(low := gain.high * (1.0 - part)))
+    if slow and prover.at_least_by_leaps(least := gain.low * (1.0 - _LEAPT[-1])):
+        ends = {end * (1.0 - part) for part in _LEAPT for end in (gain.low, gain.high)}
+        leapt = sorted((low for low in ends if low > least), reverse=True)
+        return next((low for low in leapt if prover.at_least_by_leaps(low)), least)
     most = MOST_STEPS_BELOW if slow else 2 * gain.horizon + 10
     tried = (gain.low * (1.0 - part) for part in (_FAR_BELOW if slow else _BELOW))
     return next((low for low in tried if low > 0.0 and prover.at_least_by_steps(low, most=most)), 0.0)

@@ -14,7 +14,7 @@ from designer.gain.exact import Operator, exact_gain, step
 from designer.model.error_model import error_model, link_gains
 from designer.proof import balls
 from designer.proof.by_balls import ByBalls
-from designer.proof.held_policies import HeldPolicies
+from designer.proof.held_policies import Held, HeldPolicies
 from designer.proof.prover import Prover
 from designer.search.exact_design import confirmed, lower_end
 from designer.search.starts import ignoring, least_variance_gains
@@ -32,6 +32,22 @@ def scalar(radius: float) -> Problem:
             "markov": {"transition": [[1.0]], "initial": "t"},
         }
     )
+
+
+def turning(*modes: tuple[float, float]) -> tuple[Problem, float]:
+    """States that turn by an angle in each step and that two nodes do not look at; and the gain, of the gramian."""
+    A, k = np.zeros((2 * len(modes), 2 * len(modes))), np.arange(2 * len(modes))
+    for i, (radius, angle) in enumerate(modes):
+        turn = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = radius * np.array(turn)
+    B, M = np.stack([1.0 + 0.3 * k, 1.0 - 0.5 * k], axis=1), (1.0 - 0.7 * k)[None]
+    powers, gramian = A, B @ B.T
+    for _ in range(30):
+        gramian, powers = gramian + powers @ gramian @ powers.T, powers @ powers
+    document = scalar(0.5).document() | {"plant": {"A": A.tolist(), "B": B.tolist(), "M": M.tolist()}}
+    node = {"C": [(0.0 * k).tolist()], "D": [[1.0, 0.0]], "arrival_probability": 0.9}
+    document["node"] = [{"name": name, **node} for name in "ab"]
+    return Problem.from_document(document), math.sqrt(2.0 * float((M @ gramian @ M.T).item()))
 
 
 @pytest.mark.parametrize("radius", [0.999, 0.99999, 0.9999999])
@@ -55,9 +71,22 @@ def test_the_interval_of_a_slow_network_is_narrow() -> None:
     assert verdict.gamma * (1.0 - 1e-5) < low <= gain.high
 
 
+@pytest.mark.parametrize("of", [[(0.9999, 0.01)], [(0.99999, 1.5)], [(0.999, 0.2), (0.999, 1.1)]])
+def test_what_oscillates_slowly_is_proved_at_any_radius(of: list[tuple[float, float]]) -> None:
+    """By a policy that is worst in every phase; of two at once too, though one step of w cannot move both as it likes.
+
+    Nothing is proved of more than the gain.
+    """
+    problem, true = turning(*of)
+    prover = Prover(problem, *link_gains(problem, *ignoring(problem)))
+    assert prover.at_least_by_leaps(true * (1.0 - 1e-5)) is not None
+    assert prover.at_least_by_leaps(true * (1.0 + 1e-6)) is None
+
+
+@pytest.mark.parametrize("like", [False, True])
 @pytest.mark.parametrize("steps", [1, 2, 64, 256])
-def test_a_leap_is_below_as_many_steps(steps: int) -> None:
-    """And is what the policies lead to, step by step; for lossy links, seen losses and two modes."""
+def test_a_leap_is_below_as_many_steps(steps: int, like: bool) -> None:
+    """And is what the policies lead to, step by step; for lossy links, seen losses and two modes; against any P."""
     problem = real_network(random_problem(11, n=2), seen=["n1"], delivery=0.7)
     K_bar, H_bar = random_gains(problem, seed=1)
     K_bar, H_bar = 0.4 * K_bar, 0.4 * H_bar
@@ -69,8 +98,10 @@ def test_a_leap_is_below_as_many_steps(steps: int) -> None:
     Y = by.start(up=False)
     for _ in range(3):
         Y = by.step(Y, gamma, up=False)[1] or Y
-    leapt, true = by.leap(Y, gamma, steps), np.array([balls.floats(Y_s) for Y_s in Y])
-    taken = step(operator, true, gamma**2)
+    true = np.array([balls.floats(Y_s) for Y_s in Y])
+    other = 2.0 * true / gamma**2 if like else None
+    leapt = by.leap(Y, gamma, steps, other)
+    taken = step(operator, true if other is None else other, gamma**2 if other is None else 1.0)
     assert leapt is not None
     assert taken is not None
     held, Gamma = true, taken.Gamma
@@ -95,12 +126,12 @@ def test_a_disturbance_that_costs_nothing_would_prove_too_much(monkeypatch: pyte
     problem = scalar(0.9999)
     prover, true = Prover(problem, *link_gains(problem, *ignoring(problem))), math.sqrt(2.0 / (1.0 - 0.9999**2))
     assert prover.at_least_by_leaps(1.01 * true) is None
-    after = HeldPolicies.after
+    held = HeldPolicies.held
 
-    def free(self: HeldPolicies, Y: list[arb_mat], policies: list[arb_mat], gamma: float, steps: int) -> list[arb_mat]:
-        return after(self, Y, policies, 0.0, steps)
+    def free(self: HeldPolicies, policies: list[arb_mat], gamma: float) -> Held:
+        return held(self, policies, 0.0)
 
-    monkeypatch.setattr(HeldPolicies, "after", free)
+    monkeypatch.setattr(HeldPolicies, "held", free)
     assert prover.at_least_by_leaps(1.01 * true) is not None
 
 

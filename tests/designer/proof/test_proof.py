@@ -25,8 +25,9 @@ from agent.contract.errors import EXIT_GOOD, EXIT_NO, InputError
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.decay import decay, scaled
+from designer.decay import decay
 from designer.gain.exact import Operator, exact_gain, horizon_gain
+from designer.invariants import scaled
 from designer.lmi.back_off import back_off, coupled_lyapunov, inequality_17, least_gamma, relaxed
 from designer.model.error_model import ErrorModel, error_model, link_gains, stacked_gains, stacked_links
 from designer.problems import find
