@@ -85,7 +85,8 @@ ROOMS = {
     "designer.replay": "agent.contract.recording designer.chance designer.gain designer.ledger designer.model "
     "designer.proof",
     "designer.identify": "designer.box designer.gain designer.model designer.replay",
-    "designer.report": "designer.beyond_gamma designer.chance designer.ladder designer.model designer.replay",
+    "designer.report": "designer.beyond_gamma designer.chance designer.ladder designer.model designer.proof "
+    "designer.replay",
     "designer.compare": "agent.contract.recording",
     "designer.export": "designer.model designer.replay",
     "designer.watch": "designer.ledger",

@@ -46,6 +46,7 @@ def verify_command(options: argparse.Namespace) -> int:
     from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
+    from designer.proof.silent import least_again
 
     if options.settings and options.problem is None:
         raise InputError(f"--set {options.settings[0]} is for PROBLEM; name the problem that the gains have to be for")
@@ -59,8 +60,12 @@ def verify_command(options: argparse.Namespace) -> int:
     try:
         verdict = verify(gains, makes=BALLS if options.balls else FLOATS + BALLS)
         verdict, in_box = _with_box(verdict, gains, problem, options)
+        least = least_again(gains) if verdict.holds else None
     except InputError as error:
         raise InputError(f"{options.gains}: {error}") from None
+    if least is False:
+        why = f"no gains may have less by the LMI than {gains.certificate.lmi_least}, it claims, and its own have less"
+        verdict = verdict._replace(holds=False, failure=why)
     asked_for = bool(options.within) or "tolerance" in differs
     good = EXIT_GOOD if verdict.holds and not (asked_for and in_box and in_box.gamma is None) else EXIT_NO
     seconds, claim = time.perf_counter() - started, gains.certificate
@@ -69,11 +74,16 @@ def verify_command(options: argparse.Namespace) -> int:
     proved = [PROVED[claim.kind]]
     if claim.theorem1_gamma is not None:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
+    if least:
+        proved.append(
+            f"no gains have less than {claim.lmi_least} by an LMI of this form: no node sees some disturbance"
+        )
     if options.json:
         said: dict[str, object] = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
+        said["lmi_least_proved"] = least is True
         said["within"] = None if in_box is None else in_box.document()
         of = _of_problem(gains, options.gains)
-        print(json.dumps(verdict._asdict() | said | of | {"claimed": _claimed(gains, verdict.low)}))
+        print(json.dumps(verdict._asdict() | said | of | {"claimed": _claimed(gains, verdict.low, least)}))
         return good
     lines = [f"of      {text}" for text in _whose(gains, differs)]
     if verdict.holds:
@@ -81,7 +91,7 @@ def verify_command(options: argparse.Namespace) -> int:
             proved.append(f"the exact gain is between {verdict.low} and {verdict.gamma}: below, some w does worse")
         lines = [f"holds: gamma = {verdict.gamma} is proved", *lines, *(f"proved  {text}" for text in proved)]
         lines += [] if in_box is None else in_box.of_verify()
-        lines += [f"claimed {text}" for text in _claimed(gains, verdict.low)]
+        lines += [f"claimed {text}" for text in _claimed(gains, verdict.low, least)]
     else:
         no = f"gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
         if verdict.low_is_false:
@@ -163,11 +173,13 @@ def _whose(gains: Gains, differs: list[str]) -> list[str]:
     return lines
 
 
-def _claimed(gains: Gains, low: float | None) -> list[str]:
+def _claimed(gains: Gains, low: float | None, least: bool | None) -> list[str]:
     """What stands in the file too, and is not proved here."""
-    beside = ("floor", "lmi_gamma", "lmi_least", "lmi_exact", *(("exact",) if low is None else ()))
+    beside = ("floor", "lmi_gamma", "lmi_exact", *(("exact",) if low is None else ()))
     there = [name for name in beside if getattr(gains.certificate, name) is not None]
     found = [f"{listed(there)}: computed by whoever designed the gains"] if there else []
+    if gains.certificate.lmi_least is not None and not least:
+        found.append(f"lmi_least = {gains.certificate.lmi_least}: not proved here, but when they were designed")
     if gains.worst_case is not None:
         found.append("worst_case: a w of energy 1; that no other fixed w does worse is not proved")
     return found

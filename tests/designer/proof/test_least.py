@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from networks import random_gains, random_problem, real_network
+from places import ROOT
 
 from agent.contract.arrays import Array
+from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from designer.cli import main
 from designer.gain.exact import Operator
 from designer.lmi import multipliers
 from designer.lmi.multipliers import least_of_lmi
@@ -15,7 +20,7 @@ from designer.model.error_model import error_model
 from designer.problems import find
 from designer.proof import least, silent
 from designer.proof.least import at_least
-from designer.proof.silent import at_least_by_silence
+from designer.proof.silent import at_least_by_silence, least_again
 from designer.search.starts import node_regression
 from designer.synthesis import design
 
@@ -168,3 +173,38 @@ def test_eigenvalues_that_balls_do_not_tell_apart_prove_nothing() -> None:
     """A double one has no vector that is enclosed; a complex pair none that is real."""
     for rows in ([[2.0, 0.0], [0.0, 2.0]], [[1.0, -2.0], [2.0, 1.0]]):
         assert list(silent._real_pairs(silent.exact(np.array(rows)))) == []
+
+
+def claiming(name: str, least: float) -> Gains:
+    """Gains of the LMI, of a problem of the paper, whose file claims that."""
+    gains = Gains.load(ROOT / "recordings" / "golden" / f"{name}.gains.json")
+    return gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"lmi_least": least})})
+
+
+def test_what_a_file_claims_of_the_lmi_is_proved_again_refuted_or_left_open() -> None:
+    """By the silent disturbance, by the P in the file, and between both not at all."""
+    found = at_least_by_silence(find("zhu2020-ideal"))
+    assert found is not None
+    assert least_again(claiming("zhu2020-ideal", found)) is True
+    assert least_again(claiming("zhu2020-ideal", float(np.nextafter(found, 1.0)))) is None
+    own = claiming("zhu2020-ideal", 0.1).certificate.gamma
+    assert least_again(claiming("zhu2020-ideal", own)) is None
+    assert least_again(claiming("zhu2020-ideal", float(np.nextafter(own, 1.0)))) is False
+    assert least_again(claiming("zhu2020-lossy", 0.3479)) is None
+
+
+@pytest.mark.parametrize(
+    ("least", "code", "says"),
+    [
+        (0.3297, 0, "proved  no gains have less than 0.3297 by"),
+        (0.3297735, 1, "its own have less"),
+        (0.329773, 0, "claimed lmi_least = 0.329773: not proved here"),
+    ],
+)
+def test_verify_says_which(
+    least: float, code: int, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gains.json"
+    path.write_bytes(claiming("zhu2020-ideal", least).canonical())
+    assert main(["verify", str(path)]) == code
+    assert says in capsys.readouterr().out
