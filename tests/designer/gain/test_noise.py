@@ -95,7 +95,7 @@ def test_large_networks_are_solved_without_a_matrix(monkeypatch: pytest.MonkeyPa
     problem = random_problem(6)
     gains = least_variance_gains(problem)
     small = of(problem, gains)
-    monkeypatch.setattr(decay, "_DENSE", 1)
+    monkeypatch.setattr(decay, "DENSE", 1)
     large = of(problem, gains)
     np.testing.assert_allclose(large.nodes, small.nodes, rtol=1e-8)
     assert large.error < noise.SETTLED
