@@ -97,6 +97,7 @@ class Proved(NamedTuple):
     failure: str | None  # where it does not hold
     margins: dict[str, float]  # of each inequality and mode
     low: float | None  # the exact gain is not below it
+    low_is_false: bool  # gamma is proved, and the lower end that was claimed proved false
     within: Robust | None  # its `gamma` is proved for every model of the box; None: no box
 
 
@@ -113,7 +114,7 @@ def verify(gains: Gains | Name, *, within: Within | None = None, balls: bool = F
     found = gains_of(gains)
     verdict = verify(found, makes=BALLS if balls else FLOATS + BALLS)
     verdict, in_box = with_box(verdict, found, found.problem, _texts(within), balls=balls)
-    return Proved(*verdict, within=in_box)
+    return Proved(**verdict._asdict(), within=in_box)
 
 
 def simulate(
