@@ -100,8 +100,8 @@ ROOMS = {
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
     # the library, whose source stands in designer/library/
-    "peakmesh.answers": "designer.analysis designer.problems designer.proof designer.replay designer.report "
-    "designer.search designer.simulation designer.synthesis",
+    "peakmesh.answers": "designer.analysis designer.box designer.problems designer.proof designer.replay "
+    "designer.report designer.search designer.simulation designer.synthesis",
     "peakmesh.sensors": "",
     "peakmesh.functions": "agent.within peakmesh.sensors",
     "peakmesh.running": "agent.commands agent.contract.recording agent.guests agent.launch agent.plan designer.replay "

@@ -37,7 +37,7 @@ class BoxClaim(Model):
     """What is said of every model in the box that the problem has: its `uncertainty`, and every `tolerance`.
 
     `ends`, `rows` and `signs` say which corner the worst model is that was found (`designer.box.extent.truth_at`); a
-    proof takes its weights from there, and believes none of it.
+    proof makes its weights from there, by `start` and `rounds` (`designer.box.weights`), and believes none of it.
     """
 
     gamma: Number | None = Field(default=None, gt=1e-150, lt=1e150)  # None: none is proved, and that is why:
@@ -46,6 +46,8 @@ class BoxClaim(Model):
     ends: tuple[bool, ...]
     rows: tuple[int, ...]
     signs: tuple[int, ...]
+    start: int = Field(default=0, strict=True, ge=0)
+    rounds: tuple[tuple[Number, Number], ...] = ()  # gamma and share of each
 
 
 class Certificate(Model):

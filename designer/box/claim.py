@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from agent.contract.errors import InputError
 from agent.contract.gains import BoxClaim, Gains
-from designer.box.extent import Box, box_in, truth_at
-from designer.box.robust import Robust, proved_at
+from agent.contract.problem import Problem
+from designer.box.extent import Box, asked, box_in, truth_at
+from designer.box.robust import Robust, proved_at, robust
+from designer.box.weights import Recipe, Round
 from designer.box.worst import Worst
+from designer.proof.findings import Verdict
 
 
 def with_claim(gains: Gains, found: Robust) -> Gains:
@@ -20,6 +24,8 @@ def with_claim(gains: Gains, found: Robust) -> Gains:
         ends=found.worst.ends,
         rows=found.worst.rows,
         signs=found.worst.signs,
+        start=found.recipe.start,
+        rounds=found.recipe.rounds,
     )
     return gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"box": claim})})
 
@@ -38,8 +44,29 @@ def again(gains: Gains, *, balls: bool = False) -> Robust | None:
     truth = truth_at(gains.problem, box, *_fitting(claim, box))
     gain = math.inf if claim.found is None else claim.found
     worst = Worst(truth, gain, claim.ends, claim.rows, claim.signs)
-    verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, balls=balls)
-    return Robust(box, worst, verdict)
+    recipe = Recipe(claim.start, tuple(Round(*each) for each in claim.rounds))
+    verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, recipe, balls=balls)
+    return Robust(box, worst, verdict, recipe)
+
+
+def with_box(
+    verdict: Verdict, gains: Gains, problem: Problem, within: Sequence[str] = (), *, balls: bool = False
+) -> tuple[Verdict, Robust | None]:
+    """What was proved of the gains, and what is of the box asked for, or else of that of the problem.
+
+    The claim that the file makes of its own box has to be true, or nothing holds. Raises InputError as `again` does,
+    and for what is no box.
+    """
+    if not verdict.holds:
+        return verdict, None
+    claimed = again(gains, balls=balls)
+    if claimed is not None and claimed.gamma is None:
+        why = f"as it claims for every model of its box: {claimed.why_not}"
+        return verdict._replace(holds=False, gamma=gains.certificate.box_gamma or 0.0, failure=why), None
+    if claimed is not None and not within and gains.problem == problem:
+        return verdict, claimed
+    box = asked(problem, within)
+    return verdict, None if box is None else robust(gains.problem, gains.K, gains.H, box, balls=balls)
 
 
 def _fitting(claim: BoxClaim, box: Box) -> tuple[tuple[bool, ...], tuple[int, ...], tuple[int, ...]]:

@@ -118,6 +118,11 @@ def box_in(problem: Problem) -> Box | None:
     return box if box.corners > 1 or box.entries else None
 
 
+def asked(problem: Problem, texts: Sequence[str]) -> Box | None:
+    """The box of these `name=size`, or where there are none that of the problem. Raises InputError as both do."""
+    return box_of(problem, within(texts)) if texts else box_in(problem)
+
+
 def _text(size: Tolerance) -> str:
     return f"{float(100 * size.size):g} %" if size.relative else f"{float(size.size):g}"
 

@@ -11,7 +11,9 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.uncertainty import Tolerance
 from designer.box.extent import Box, box_of, corners
-from designer.box.robust import ends, invariant, weights_of
+from designer.box.robust import ends
+from designer.box.tail import invariant
+from designer.box.weights import mixed, weights_of
 from designer.box.worst import There
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
@@ -140,6 +142,10 @@ def attempted(
 ) -> Attempt | None:
     """With the weights of the nominal model; None: as far as floats tell this gamma is not proved so."""
     T = There.of(problem, K, H, box).T
-    by = ByVertices([Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)], weights)
-    P = invariant(by, Operator(nominal))
-    return Attempt(by, P) if P is not None and ends(by, P, gamma**2, _STEPS) else None
+    models = [Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)]
+    tail = invariant(ByVertices(models, weights), Operator(nominal))
+    if tail is None:
+        return None
+    P, X = tail
+    by = ByVertices(models, mixed(weights, X) if box.entries else weights, X)
+    return Attempt(by, P) if ends(by, P, gamma**2, _STEPS) else None

@@ -3,37 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from agent.contract.arrays import Array
+from agent.contract.errors import counted
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, corners
+from designer.box.tail import invariant
+from designer.box.weights import Recipe, Round, mixed, moved, starts
 from designer.box.worst import There, Worst, worst
-from designer.decay import decay, is_positive
-from designer.gain.exact import Operator, exact_gain
-from designer.gain.sensitivity import sweep
-from designer.invariants import scaled
+from designer.decay import is_positive
+from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import Truth, told
-from designer.proof.by_vertices import ByVertices, prove, upper_bound
+from designer.proof.by_vertices import ByVertices, prove
 from designer.proof.cube import Cube
 from designer.proof.findings import Verdict
 from designer.proof.recursion import Arithmetic
 from designer.proof.vertices_by_balls import VerticesByBalls
 
-_WIDTH = 1e-5  # of gamma^2 of the weights' model
-_HORIZON, _BEGINNING = 60, 30  # steps of the weights, and before them, from rest
-_SETTLED, _BEYOND, _MOST_ROUNDS = 1e-3, 1e8, 300  # of the search for P
-_ABOVE = (0.01, 0.1)  # gamma^2 of the weights above that of their model
-_RIDGE = 1e-3
 _MOST_STEPS = 2000
 _CLOSE = 1e-4  # relative width of the search for g
 _FAR = 100.0  # times the worst that was found: nothing is sought beyond
-_MORE = (0.0, 0.1, 0.3, 0.6)  # growth beyond the mean of the corners, of which P is made
 _CLAIMED = (1e-6, 1e-5, 1e-4, 1e-3)  # gamma beyond what floats find, until it is proved
+_SHARE, _LEAST_SHARE = 0.4, 0.1  # how far the first round of the weights goes, and the last
+_BEYOND = (0.02, 0.02, 0.01, 0.01, 0.005, 0.005, 0.002, 0.002)  # g of every round, beyond the least
 
 
 class Robust(NamedTuple):
@@ -42,6 +41,7 @@ class Robust(NamedTuple):
     box: Box
     worst: Worst  # constant model that was found
     verdict: Verdict | None  # None: no P for all corners was found, or no gamma
+    recipe: Recipe = Recipe(0, ())  # of the weights that prove it
 
     @property
     def found(self) -> float:
@@ -60,6 +60,7 @@ class Robust(NamedTuple):
             "corners": self.box.corners,
             "intervals": [[part.what, part.low, part.high] for part in self.box.intervals],
             "worst_found": self.found if math.isfinite(self.found) else None,
+            "worst_model": self.worst.document(),
             "proved": self.gamma,
             "why_not": None if self.gamma is not None else self.why_not,
         }
@@ -76,6 +77,9 @@ class Robust(NamedTuple):
                 for part, upper in zip(self.box.intervals, self.worst.ends, strict=True)
             )
             lines.append(f"           worst found at {at}")
+        if self.box.entries:
+            off = counted(len(self.box.entries), "entry")
+            lines.append(f"           worst found with {off} of matrices off by all they may; --json has the model")
         if self.gamma is None:
             lines.append(f"           no gamma is proved for the box: {self.why_not}")
         return lines
@@ -109,42 +113,48 @@ def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, *, ball
     if not math.isfinite(found.gain):
         return Robust(box, found, None)
     models, likely = _models(problem, K, H, box, found.truth)
-    least = _sought(models, likely, Operator(likely[-1]), found.gain**2)
+    least = _sought(models, likely, found.gain**2)
     if least is None:
         return Robust(box, found, None)
-    g, by, P = least
     for more in _CLAIMED:
-        verdict = prove(by, problem.mode_names, math.sqrt(g) * (1.0 + more), P)
+        verdict = prove(least.by, problem.mode_names, math.sqrt(least.g) * (1.0 + more), least.P)
         if verdict.holds:
             break
+    gamma, recipe = verdict.gamma, least.recipe
     if balls and verdict.holds:
-        return Robust(box, found, proved_at(problem, K, H, box, found.truth, verdict.gamma, balls=True))
-    return Robust(box, found, verdict)
+        return Robust(box, found, proved_at(problem, K, H, box, found.truth, gamma, recipe, balls=True), recipe)
+    return Robust(box, found, verdict, recipe)
 
 
 def proved_at(
-    problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth: Truth, gamma: float, *, balls: bool = False
+    problem: Problem,
+    K: LinkMatrices,
+    H: LinkMatrices,
+    box: Box,
+    truth: Truth,
+    gamma: float,
+    recipe: Recipe,
+    *,
+    balls: bool = False,
 ) -> Verdict | None:
-    """Whether gamma holds for every model of the box, with what the search takes for the proof; None: it finds nothing.
+    """Whether gamma holds for every model of the box, with the weights of the recipe; None: there are none.
 
     `truth`: a model of the box in which the worst w is like the worst of all. `balls`: in ball arithmetic.
     """
     models, likely = _models(problem, K, H, box, truth)
-    middle, P, mean, verdict = Operator(likely[-1]), None, None, None
-    for weights in (found for model in likely for above in _ABOVE if (found := weights_of(model, above)) is not None):
-        by = ByVertices(models, weights, mean)
-        if P is None:
-            P, mean = invariant(by, middle), by.mean
-        if P is not None and ends(by, P, gamma**2):
-            arithmetic: Arithmetic = by
-            if balls:
-                arithmetic = VerticesByBalls(
-                    problem, K, H, [model.truth for model in models], box.entries, by, T=models[0].T
-                )
-            verdict = prove(arithmetic, problem.mode_names, gamma, P)
-            if verdict.holds:
-                break
-    return verdict
+    ends_by = next(islice(_begun(models, likely), recipe.start, None), None)
+    if ends_by is None:
+        return None
+    by, P = ends_by
+    for to in recipe.rounds:
+        weights = moved(by, Operator(likely[-1]).units, to)
+        if weights is None:
+            return None
+        by = ByVertices(models, weights, by.mean)
+    arithmetic: Arithmetic = by
+    if balls:
+        arithmetic = VerticesByBalls(problem, K, H, [model.truth for model in models], box.entries, by, T=models[0].T)
+    return prove(arithmetic, problem.mode_names, gamma, P)
 
 
 def _models(
@@ -157,24 +167,51 @@ def _models(
     return [Cube(problem, K, H, corner, box.entries, there.T) for corner in every], likely
 
 
-def _sought(
-    models: list[Cube], likely: list[ErrorModel], middle: Operator, low: float
-) -> tuple[float, ByVertices, Array] | None:
-    """The least g, the weights that gave it, of those of each likely model, and P; as far as floats tell."""
-    least: tuple[float, ByVertices, Array] | None = None
-    P: Array | None = None
-    mean: Array | None = None
-    for model in likely:
-        for above in _ABOVE:
-            weights = weights_of(model, above)
-            if weights is None:
-                continue
-            by = ByVertices(models, weights, mean)
-            if P is None:
-                P, mean = invariant(by, middle), by.mean
-            g = None if P is None else _least(by, P, low, None if least is None else least[0])
-            if g is not None and P is not None:
-                least = g, by, P
+class _Least(NamedTuple):
+    """The least g that was found, what a proof of it takes, and how that was made."""
+
+    g: float
+    by: ByVertices
+    P: Array
+    recipe: Recipe
+
+
+def _begun(models: list[Cube], likely: list[ErrorModel]) -> Iterator[tuple[ByVertices, Array]]:
+    """The weights to begin with, and P; none where no P is found."""
+    tail: tuple[Array, Array] | None = None
+    spreads = models[0].spreads
+    for weights in starts(likely, spreads=spreads):
+        tail = tail or invariant(ByVertices(models, weights), Operator(likely[-1]))
+        if tail is None:
+            return
+        P, X = tail
+        yield ByVertices(models, mixed(weights, X) if spreads else weights, X), P
+
+
+def _sought(models: list[Cube], likely: list[ErrorModel], low: float) -> _Least | None:
+    """From the best of the weights to begin with, where entries are off, to better ones; as far as floats tell."""
+    least: _Least | None = None
+    for start, (by, P) in enumerate(_begun(models, likely)):
+        g = _less(by, P, low, None if least is None else least.g)
+        if g is not None:
+            least = _Least(g, by, P, Recipe(start, ()))
+    if least is None:
+        return None
+    share, units = _SHARE, Operator(likely[-1]).units
+    for beyond in _BEYOND[:: 1 if len(models) == 1 else 2] if models[0].spreads else ():
+        to = Round(math.sqrt(least.g * (1.0 + beyond)), share)
+        weights = moved(least.by, units, to)
+        if weights is None:
+            break
+        by = ByVertices(models, weights, least.by.mean)
+        g = _less(by, least.P, low, least.g)
+        if g is None:
+            share /= 2.0
+            if share < _LEAST_SHARE:
+                break
+        else:
+            share = min(1.5 * share, 1.0)
+            least = _Least(g, by, least.P, least.recipe._replace(rounds=(*least.recipe.rounds, to)))
     return least
 
 
@@ -182,70 +219,17 @@ def _differs(one: Truth, other: Truth) -> bool:
     return bool((one.beta != other.beta).any() or (one.rho != other.rho).any())
 
 
-@np.errstate(all="ignore")  # what overflows is no P
-def invariant(by: ByVertices, middle: Operator) -> Array | None:
-    """P with (17) at every corner, as far as floats tell; None: not found.
-
-    That of a model in the middle of the box, or of more growth than it has; else what grows as the box may.
-    """
-    n, modes = by.order, len(middle.MM)
-    for more in () if any(corner.spreads for corner in by.corners) else _MORE:
-        found = decay(lambda Y, more=more: (1.0 + more) * middle.corner(Y), modes, middle.units)  # type: ignore[misc]
-        P = None if found.total is None or not found.dies_out else _scaled(by, found.total)
-        if P is not None:
-            return P
-    U = np.broadcast_to(np.diag(middle.units**2), (modes, n, n))
-    Z = U
-    for _ in range(_MOST_ROUNDS):
-        following = U + upper_bound(by.of(Z), by.mean)[:, :n, :n]
-        change, Z = np.abs(following - Z).max() / np.abs(following).max(), following
-        if not change > _SETTLED:
-            return _scaled(by, Z)
-        if not (Z.diagonal(axis1=1, axis2=2) < _BEYOND * middle.units**2).all():
-            break
-    return None
-
-
-def _scaled(by: ByVertices, Z: Array) -> Array | None:
-    """The largest multiple of Z that satisfies (17) at every corner; None: none does."""
-    n, every = by.order, by.of(Z)
-    rests = [Z - S[:, :n, :n] for S in every]
-    if not all(is_positive(rest) for rest in rests):
-        return None
-    multiples = [scaled(lambda _, S=S: S, Z, rest) for S, rest in zip(every, rests, strict=True)]  # type: ignore[misc]
-    return min(multiples, key=lambda P: float(np.trace(P, axis1=1, axis2=2).sum()))
-
-
-def weights_of(model: ErrorModel, above: float) -> Array | None:
-    """What [eta; w] is like, step by step from the last, while the worst w acts; (T, modes, n_eta + nw, the same).
-
-    None: not mean-square stable.
-    """
-    operator = Operator(model)
-    gain = exact_gain(model, width=_WIDTH)
-    swept = sweep(operator, gain.high**2 * (1.0 + above), _HORIZON + _BEGINNING) if gain.stable else None
-    if swept is None:
-        return None
-    n, modes = operator.size, len(operator.MM)
-    X, joint = np.zeros((modes, n, n)), np.zeros((_HORIZON + _BEGINNING, modes, n + operator.nw, n + operator.nw))
-    for k in range(len(joint) - 1, -1, -1):
-        GX = swept.Gamma[k] @ X
-        joint[k, :, :n, :n], joint[k, :, n:, :n], joint[k, :, :n, n:] = X, GX, GX.swapaxes(1, 2)
-        joint[k, :, n:, n:] = GX @ swept.Gamma[k].swapaxes(1, 2) + swept.W_inverse[k] / np.abs(swept.W_inverse).max()
-        X = operator.carry(joint[k])
-    joint = joint[:_HORIZON]
-    mean = joint.mean(axis=0)
-    everywhere = mean.mean(axis=0)
-    return np.asarray(joint + _RIDGE * (mean + everywhere + np.diag(_RIDGE * everywhere.diagonal())))
-
-
-def _least(by: ByVertices, P: Array, low: float, best: float | None) -> float | None:
+def _less(by: ByVertices, P: Array, low: float, best: float | None) -> float | None:
     """The least g at which the recursion comes to Y < g P, as far as floats tell; None: not below `best`."""
     high = low * 1.005 if best is None else best * (1.0 - 2.0 * _CLOSE)
     while not ends(by, P, high):
         if best is not None or high > _FAR * low:
             return None
         low, high = high, low + 2.5 * (high - low)
+    fall = 2.0 * _CLOSE
+    while (lower := high * (1.0 - fall)) > low and ends(by, P, lower):
+        high, fall = lower, 3.0 * fall
+    low = max(low, lower)
     while high > low * (1.0 + _CLOSE):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if ends(by, P, middle) else (middle, high)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,20 +12,22 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.matrices import matrices_of
+from designer.box.deviating import worst_constant
 from designer.box.extent import Box, truth_at
 from designer.coordinates import Coordinates
 from designer.gain.exact import exact_gain
 from designer.model.error_model import ErrorModel, stacked_links
 from designer.model.mismatch import Real, real_error_model
 from designer.proof.ball_model import Truth
+from designer.proof.cube import Cube
 
 _WIDTH = 1e-5  # of gamma^2: models are compared by that
 _ROUNDS = 3
-_FEW_ENTRIES = 30  # of more, signs are not tried again together
+_TURNS = 2  # probabilities and entries, each for the others
 
 
 class Worst(NamedTuple):
-    """A corner that no change of a single probability, row or entry makes worse, or the last of so many rounds.
+    """A corner that no change of a single probability or row makes worse, nor a step along the slope of the entries.
 
     `ends`, `rows` and `signs` are those of `designer.box.extent.truth_at`, which gives `truth` for them.
     """
@@ -35,6 +37,17 @@ class Worst(NamedTuple):
     ends: tuple[bool, ...]
     rows: tuple[int, ...]
     signs: tuple[int, ...]
+
+    def document(self) -> dict[str, Any]:
+        """The model, for --json: nodes and modes in the order of the problem; matrices, where entries may be off."""
+        truth = self.truth
+        said = {"arrival": truth.beta, "delivery": truth.rho, "transition": real_transition(truth)}
+        if truth.matrices is not None:
+            said |= {letter: getattr(truth.matrices, letter) for letter in "ABM"}
+        found: dict[str, Any] = {name: numbers.tolist() for name, numbers in said.items()}
+        if truth.matrices is not None:
+            found |= {letter: [of.tolist() for of in getattr(truth.matrices, letter)] for letter in "CD"}
+        return found
 
 
 class There(NamedTuple):
@@ -68,8 +81,12 @@ def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth)
 
 def real(problem: Problem, truth: Truth) -> Real:
     """The same in floats."""
-    transition = np.array([[float(pi) for pi in row] for row in truth.transition])
-    return Real(truth.beta, truth.rho, transition, truth.matrices or matrices_of(problem))
+    return Real(truth.beta, truth.rho, real_transition(truth), truth.matrices or matrices_of(problem))
+
+
+def real_transition(truth: Truth) -> Array:
+    """Pi in floats."""
+    return np.array([[float(pi) for pi in row] for row in truth.transition])
 
 
 def _ascent(
@@ -90,8 +107,7 @@ def _ascent(
 
 
 def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst:
-    """Probabilities and rows first, with the matrices of the file; then each entry's sign alone; then all again,
-    where there are few entries."""
+    """Probabilities and rows first, with the matrices of the file; then all entries at once; then both again."""
     split, last = len(box.intervals), len(box.intervals) + len(box.rows)
     choices: list[list[int]] = [[0, 1]] * split + [list(range(len(rows))) for rows in box.rows]
     choices += [[-1, 1]] * len(box.entries)
@@ -106,10 +122,17 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
 
     at = [0] * len(choices)
     at, most = _ascent(gain_at, at, gain_at(at), choices[:last])
-    if box.entries and math.isfinite(most):
-        up = [gain_at([*at[:place], 1, *at[place + 1 :]]) for place in range(last, len(at))]
-        at = at[:last] + [1 if gain >= most else -1 for gain in up]
-        most = gain_at(at)
-        if len(box.entries) <= _FEW_ENTRIES:
-            at, most = _ascent(gain_at, at, most, choices)
-    return Worst(truth(at), most, tuple(bool(k) for k in at[:split]), tuple(at[split:last]), tuple(at[last:]))
+    for _ in range(_TURNS if any(len(options) > 1 for options in choices[:last]) else 1):
+        if not (box.entries and math.isfinite(most)):
+            break
+        cube = Cube(problem, K, H, truth_at(problem, box, *_corner(at, split, last)), box.entries)
+        tried = at[:last] + list(worst_constant(cube, most).signs(cube, 0, 0))
+        gain = gain_at(tried)
+        if not gain > most:
+            break
+        at, most = _ascent(gain_at, tried, gain, choices[:last])
+    return Worst(truth(at), most, *_corner(at, split, last), tuple(at[last:]))
+
+
+def _corner(at: list[int], split: int, last: int) -> tuple[tuple[bool, ...], tuple[int, ...]]:
+    return tuple(bool(k) for k in at[:split]), tuple(at[split:last])

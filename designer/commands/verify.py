@@ -16,8 +16,6 @@ from designer.commands.within import add_within, asked
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
-    from designer.box.robust import Robust
-    from designer.proof.findings import Verdict
 
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
@@ -43,6 +41,7 @@ def add_verify(commands: Subcommands) -> None:
 
 def verify_command(options: argparse.Namespace) -> int:
     """`peakmesh verify GAINS [PROBLEM]`."""
+    from designer.box.claim import with_box
     from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
@@ -59,7 +58,7 @@ def verify_command(options: argparse.Namespace) -> int:
     started = time.perf_counter()
     try:
         verdict = verify(gains, makes=BALLS if options.balls else FLOATS + BALLS)
-        verdict, in_box = _with_box(verdict, gains, problem, options)
+        verdict, in_box = with_box(verdict, gains, problem, options.within, balls=options.balls)
         least = least_again(gains) if verdict.holds else None
     except InputError as error:
         raise InputError(f"{options.gains}: {error}") from None
@@ -100,25 +99,6 @@ def verify_command(options: argparse.Namespace) -> int:
         lines = [f"does not hold: {no}", *lines]
     print("\n".join([*lines, f"in      {how}"]))
     return good
-
-
-def _with_box(
-    verdict: Verdict, gains: Gains, problem: Problem, options: argparse.Namespace
-) -> tuple[Verdict, Robust | None]:
-    """What is proved of the box that is asked for, or else of the file's own, of which its claim has to be true."""
-    from designer.box.claim import again
-    from designer.box.robust import robust
-
-    if not verdict.holds:
-        return verdict, None
-    claimed = again(gains, balls=options.balls)
-    if claimed is not None and claimed.gamma is None:
-        why = f"as it claims for every model of its box: {claimed.why_not}"
-        return verdict._replace(holds=False, gamma=gains.certificate.box_gamma or 0.0, failure=why), None
-    if claimed is not None and not options.within and gains.problem == problem:
-        return verdict, claimed
-    box = asked(problem, options.within)
-    return verdict, None if box is None else robust(gains.problem, gains.K, gains.H, box, balls=options.balls)
 
 
 def _differences(found: Problem, wanted: Problem) -> list[str]:

@@ -25,6 +25,6 @@ def add_within(parser: argparse.ArgumentParser, what: str = "prove gamma for eve
 
 def asked(problem: Problem, texts: Sequence[str]) -> Box | None:
     """The box that gamma is asked for: of --within, or else that of the problem."""
-    from designer.box.extent import box_in, box_of, within
+    from designer.box import extent
 
-    return box_of(problem, within(texts)) if texts else box_in(problem)
+    return extent.asked(problem, texts)

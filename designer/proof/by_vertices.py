@@ -11,13 +11,18 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
 from designer.proof.balls import UNDECIDED, Sign, of_blocks
-from designer.proof.by_floats import ByFloats, square
+from designer.proof.by_floats import square
+from designer.proof.cube import Cube
 from designer.proof.findings import Verdict, failure, found, margins, proved
 from designer.proof.float64 import Bounded, bounded_below, difference, quotient, raised, sign, symmetric, weights
 from designer.proof.recursion import Arithmetic, recursion
+
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 _ABOVE = 1e-10  # of its own size Z stands above what floats find: more than they err by
 _OUTWEIGHS = 4.0  # times what S(Y) may be off by in floats, Z stands above that too
@@ -38,7 +43,7 @@ class ByVertices:
     something is said of P; without it the mean of all weights.
     """
 
-    def __init__(self, corners: Sequence[ByFloats], weights: Array, mean: Array | None = None) -> None:
+    def __init__(self, corners: Sequence[Cube], weights: Array, mean: Array | None = None) -> None:
         self.corners, self.weights, first = corners, weights, corners[0]
         self.mean = np.asarray(weights.mean(axis=0)) if mean is None else mean
         self.order, self.cost = first.order, 3.0 * len(corners)
@@ -92,8 +97,8 @@ class ByVertices:
         return signs, None if grown is None else Reached(Y.steps + 1, raised(grown, up=True))
 
     def weight(self, steps: int) -> Array:
-        """Of the step before which so many were taken."""
-        return np.asarray(self.weights[min(steps, len(self.weights) - 1)])
+        """Of the step before which so many were taken; beyond all of them that of P, which the rest goes to."""
+        return np.asarray(self.weights[steps]) if steps < len(self.weights) else self.mean
 
     def _is_above(self, Z: Array, every: Sequence[Bounded]) -> bool:
         """Whether Z - S > 0 is proved at every corner, in every mode."""
@@ -118,6 +123,11 @@ class ByVertices:
         """About what a step takes for Z: not proved."""
         return upper_bound(self.of(Y, self.weight(steps)), self.weight(steps))
 
+    def carry(self, Y: Array, X: Array) -> Array:
+        """What `upper` makes of X, as one of its corners or another does: `designer.proof.cube.Cube.carry`."""
+        parts = shares(self.of(Y, X), X) if len(self.corners) > 1 else [X]
+        return np.asarray(sum(corner.carry(Y, part) for corner, part in zip(self.corners, parts, strict=True)))
+
 
 def upper_bound(S: Array, X: Array) -> Array:
     """Z(s) above every S[v](s), as far as floats tell, with tr(XZ) small; S (v, modes, m, m), X (modes, m, m) > 0.
@@ -125,22 +135,59 @@ def upper_bound(S: Array, X: Array) -> Array:
     No least upper bound of matrices exists. From the S of the largest tr(XS) on, one after the other adds the part of
     it that is above Z: with X = FF', the positive part of F'(S - Z)F.
     """
-    d = weights(X.diagonal(axis1=1, axis2=2))  # in units in which X has about 1 on its diagonal
-    X, S = X * d[:, :, None] * d[:, None, :], S / d[:, :, None] / d[:, None, :]
+    if len(S) == 1:
+        Z, lacking = symmetric(S[0]), np.zeros(len(X))
+        D = weights(Z.diagonal(axis1=1, axis2=2))
+    else:
+        d, X, S = _in_units(S, X)
+        Z = symmetric(_folded(S, X).Z)
+        D = weights(Z.diagonal(axis1=1, axis2=2))
+        lacking = -np.linalg.eigvalsh((Z - S) * D[:, :, None] * D[:, None, :])[..., 0].min(axis=0)
+        Z, D = Z * d[:, :, None] * d[:, None, :], D / d
+    i = np.arange(Z.shape[1])
+    Z[:, i, i] += (np.maximum(lacking, 0.0) + _ABOVE)[:, None] / D**2
+    return np.asarray(Z)
+
+
+def _in_units(S: Array, X: Array) -> tuple[Array, Array, Array]:
+    """Units in which X has about 1 on its diagonal, and X and S in them."""
+    d = weights(X.diagonal(axis1=1, axis2=2))
+    return d, X * d[:, :, None] * d[:, None, :], S / d[:, :, None] / d[:, None, :]
+
+
+def shares(S: Array, X: Array) -> Array:
+    """Which part of X each S[v] decides about in tr(XZ), (v, modes, m, m): their sum is about X."""
+    d, X, S = _in_units(S, X)
+    found, (_, F, order, folds), modes = np.zeros_like(S), _folded(S, X), np.arange(len(X))
+    G = np.tile(np.eye(X.shape[1]), (len(X), 1, 1))
+    for corner, (vectors, added) in zip(order[:0:-1], folds[::-1], strict=True):
+        by_vectors, along = vectors.swapaxes(1, 2) @ G @ vectors, F @ vectors
+        found[corner, modes] = along @ (by_vectors * (added[:, :, None] & added[:, None, :])) @ along.swapaxes(1, 2)
+        G = vectors @ (by_vectors * ~(added[:, :, None] | added[:, None, :])) @ vectors.swapaxes(1, 2)
+    found[order[0], modes] = F @ G @ F.swapaxes(1, 2)
+    return np.asarray(found / d[:, :, None] / d[:, None, :])
+
+
+class _Folded(NamedTuple):
+    Z: Array
+    F: Array  # X = FF'
+    order: Indices  # (v, modes), in which the corners were added
+    folds: list[tuple[Array, Flags]]  # eigenvectors of each F'(S - Z)F, and which of them were added
+
+
+def _folded(S: Array, X: Array) -> _Folded:
     values, vectors = np.linalg.eigh(X)
     roots = np.sqrt(np.maximum(values, _LEAST * values[:, -1:]))
     F, inverse = vectors * roots[:, None, :], (vectors / roots[:, None, :]).swapaxes(1, 2)
     modes, order = np.arange(len(X)), np.argsort(-np.einsum("sij,vsij->vs", X, S), axis=0)
+    folds: list[tuple[Array, Flags]] = []
     Z = S[order[0], modes]
     for corner in order[1:]:
         values, vectors = np.linalg.eigh(F.swapaxes(1, 2) @ (S[corner, modes] - Z) @ F)
         part = vectors.swapaxes(1, 2) @ inverse
         Z = Z + part.swapaxes(1, 2) @ (np.maximum(values, 0.0)[:, :, None] * part)
-    D = weights(Z.diagonal(axis1=1, axis2=2))
-    Z, i = (Z + Z.swapaxes(1, 2)) / 2.0, np.arange(Z.shape[1])
-    lacking = -np.linalg.eigvalsh((Z - S) * D[:, :, None] * D[:, None, :])[..., 0].min(axis=0)
-    Z[:, i, i] += (np.maximum(lacking, 0.0) + _ABOVE)[:, None] / D**2
-    return np.asarray(Z * d[:, :, None] * d[:, None, :])
+        folds.append((vectors, values > 0.0))
+    return _Folded(Z, F, order.astype(np.int64), folds)
 
 
 def prove(by: Arithmetic, modes: tuple[str, ...], gamma: float, P: Array) -> Verdict:

@@ -46,15 +46,14 @@ class Deviations:
         self.keys = list(dict.fromkeys(_key(entry) for entry in entries if entry.matrix != "M"))
         nz = model.M.nrows() // len(model.e)
         self.radii, self.of_M = np.zeros((len(self.keys), model.size + model.nw)), np.zeros((nz, model.size))
+        self.places: list[tuple[int, int]] = []  # of every entry in `radii`, or in `of_M`
         for entry in entries:
             columns = model.w if entry.matrix in "BD" else model.x
             if not columns:
                 raise ValueError(f"an entry of {entry.matrix} is off, and x is left out")
-            at = columns[entry.column]
-            if entry.matrix == "M":
-                self.of_M[entry.row, at] = entry.radius
-            else:
-                self.radii[self.keys.index(_key(entry)), at] = entry.radius
+            of_M, at = entry.matrix == "M", columns[entry.column]
+            self.places.append((entry.row if of_M else self.keys.index(_key(entry)), at))
+            (self.of_M if of_M else self.radii)[self.places[-1]] = entry.radius
 
     def terms(self, s: int) -> list[Term]:
         """Those of S(Y) in mode s."""

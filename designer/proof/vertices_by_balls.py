@@ -40,15 +40,16 @@ class CubeByBalls:
         self.deviations = Deviations(self.model, problem, entries)
         self.terms: list[list[Term]] = [self.deviations.terms(s) for s in self.model.modes]
 
-    def joint(self, Y: Sequence[arb_mat], X: Array) -> list[arb_mat]:
-        """Of every mode; X (modes, m, m)."""
+    def joint(self, Y: Sequence[arb_mat], X: Array) -> list[arb_mat] | None:
+        """Of every mode; X (modes, m, m). None: not proved."""
         every = self.model.joint(list(Y))
         if not self.deviations.keys:
             return every
-        return [
+        found = [
             cubed(S, *self._moved(s, Y), self.deviations.radii, X[s])
             for s, S in zip(self.model.modes, every, strict=True)
         ]
+        return _if_all(found)
 
     def _moved(self, s: int, Y: Sequence[arb_mat]) -> tuple[arb_mat, arb_mat]:
         """a (m, k) and Q (k, k)."""
@@ -61,8 +62,8 @@ class CubeByBalls:
             add(Q, term.k, term.k, term.U.transpose() * half)
         return a, Q
 
-    def ended(self, X: Array) -> list[arb_mat]:
-        """Above M'M of every model of the cube."""
+    def ended(self, X: Array) -> list[arb_mat] | None:
+        """Above M'M of every model of the cube; None: not proved."""
         model, radii = self.model, self.deviations.of_M
         if not radii.any():
             return [model.MM] * len(model.AB)
@@ -71,23 +72,28 @@ class CubeByBalls:
         add(a, [at for e_i in model.e for at in e_i], range(len(radii)), by_e)
         Q = identity(len(radii)) * square
         n = model.size
-        return [cubed(model.MM, a, Q, radii, X_s[:n, :n]) for X_s in X]
+        return _if_all([cubed(model.MM, a, Q, radii, X_s[:n, :n]) for X_s in X])
 
 
-def cubed(S: arb_mat, a: arb_mat, Q: arb_mat, radii: Array, X: Array) -> arb_mat:
-    """`designer.proof.cube.cubed` in balls: the inequalities of Young and Cauchy with weights that floats choose."""
-    by = chosen(balls.floats(a), np.abs(balls.floats(Q)), radii, X)
-    alpha, xi, weight = ([arb(float(number)) for number in numbers] for numbers in by)
+def _if_all(found: Sequence[arb_mat | None]) -> list[arb_mat] | None:
+    every = [S for S in found if S is not None]
+    return every if len(every) == len(found) else None
+
+
+def cubed(S: arb_mat, a: arb_mat, Q: arb_mat, radii: Array, X: Array) -> arb_mat | None:
+    """`designer.proof.cube.cubed` in balls: the same inequalities, floats choose the weights; None: not proved."""
+    by = chosen(balls.floats(a), balls.floats(Q), radii, X)
+    Lambda, xi = ([arb(float(number)) for number in numbers] for numbers in (by.Lambda, by.xi))
     d, rows, columns = exact(radii), range(radii.shape[0]), np.flatnonzero(radii.any(axis=0)).tolist()
-    T = arb_mat(len(rows), len(rows))
+    W = -Q
     for k in rows:
-        T[k, k] = sum((d[k, c] * xi[c] for c in columns), arb(0)) / alpha[k]
-    found = S + a * T * a.transpose()
-    spent = sum((weight[c] for c in columns), arb(0))
+        W[k, k] = W[k, k] + Lambda[k]
+    if not sign(W, by.Lambda).proved:
+        return None
+    found = S + a * W.solve(a.transpose())
+    e = [sum((d[k, c] * xi[c] for c in columns), arb(0)) for k in rows]
     for c in columns:
-        together = sum((d[k, c] * d[j, c] * abs(Q[k, j]) for k in rows for j in rows), arb(0))
-        by_itself = sum((d[k, c] * alpha[k] for k in rows), arb(0)) / xi[c]
-        found[c, c] = found[c, c] + by_itself + together * spent / weight[c]
+        found[c, c] = found[c, c] + sum((Lambda[k] * e[k] * d[k, c] for k in rows), arb(0)) / xi[c]
     return found
 
 
@@ -132,14 +138,19 @@ class VerticesByBalls(ByBalls):
         if not up:
             return Reached(0, super().start(up=False))
         with ctx.workprec(self.bits):
-            return Reached(0, [above(Y) for Y in self.corners[0].ended(self.found.mean)])
+            ended = self.corners[0].ended(self.found.mean)
+            nothing = [arb_mat(self.order, self.order, [arb("nan")] * self.order**2)] * len(self.model.modes)
+            return Reached(0, nothing if ended is None else [above(Y) for Y in ended])
 
     def step(self, Y: Any, gamma: float, *, up: bool) -> tuple[list[Sign], Any]:
         """Where not `up`: of the first corner."""
         if not up:
             signs, following = super().step(Y.Y, gamma, up=False)
             return signs, None if following is None else Reached(Y.steps + 1, following)
-        Z, X = self.found.upper(super().floats(Y.Y), Y.steps), self.found.weight(Y.steps)
+        in_floats = super().floats(Y.Y)
+        if not np.isfinite(in_floats).all():
+            return [UNDECIDED] * len(in_floats), None
+        Z, X = self.found.upper(in_floats, Y.steps), self.found.weight(Y.steps)
         with ctx.workprec(self.bits):
             exact_Z = [exact(Z_s) for Z_s in Z]
             for corner in self.corners:
@@ -158,6 +169,8 @@ class VerticesByBalls(ByBalls):
         return super().floats(Y.Y)
 
 
-def _signs(above: Sequence[arb_mat], every: Sequence[arb_mat]) -> list[Sign]:
+def _signs(above: Sequence[arb_mat], every: Sequence[arb_mat] | None) -> list[Sign]:
     """Whether what is to be above is."""
+    if every is None:
+        return [UNDECIDED] * len(above)
     return [sign(one - other, diagonal(one)) for one, other in zip(above, every, strict=True)]

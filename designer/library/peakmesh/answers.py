@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agent.contract.extras import needing
 from agent.contract.gains import Gains
@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from designer.analysis import Analysis
-    from designer.proof.findings import Verdict as Proved
+    from designer.box.robust import Robust
     from designer.replay.log import Log
     from designer.replay.verdict import Verdict
     from designer.search.descent import Progress
     from designer.simulation import Ensemble
 
 Name = str | Path  # of a file
+Within = Mapping[str, float | str]  # how far off numbers may be, by the names of `peakmesh design --within`
 Links = Mapping[str, Mapping[str, Mapping[str, Any]]]  # [mode][i][j]: a matrix for what node i hears from node j
 
 
@@ -38,27 +39,42 @@ def design(
     method: str | None = None,
     budget: float | None = None,
     peak_slack: float = 0.0,
+    within: Within | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Gains:
     """Gains with a proved gamma (`peakmesh design`); `budget` in seconds, for the method "exact".
 
     `peak_slack`: gamma may be that part larger than the least one that is found, 0.05 say, for the least noise.
+    `within`: for every model of a box, {"probabilities": 0.02, "A,B,C,D": "1%"} say; without it for that of the
+    problem, if its numbers have tolerances. What is proved of the problem's own is in `certificate.box`.
 
     Raises Unattainable where there are none, with the reason as far as it is known, InputError for a bad problem.
     """
     from designer import synthesis
+    from designer.box.claim import with_claim
+    from designer.box.extent import asked
 
-    spent = {} if budget is None else {"budget": budget}
-    return synthesis.design(find(problem), method=method, peak_slack=peak_slack, progress=progress, **spent)
+    wanted, texts = find(problem), _texts(within)
+    how: dict[str, Any] = {} if budget is None else {"budget": budget}
+    how |= {"method": method, "peak_slack": peak_slack, "progress": progress}
+    box = asked(wanted, texts)
+    if box is None:
+        return synthesis.design(wanted, **how)
+    found = synthesis.design_in_box(wanted, box, **how)
+    return found.gains if texts else with_claim(found.gains, found.robust)
 
 
 @needing("analyse")
-def analyse(problem: Problem | Name, gains: Gains | Name | tuple[Links, Links]) -> Analysis:
+def analyse(
+    problem: Problem | Name, gains: Gains | Name | tuple[Links, Links], *, within: Within | None = None
+) -> Analysis:
     """What gains do on a problem, whoever made them (`peakmesh analyse`); (K, H) are those of eq. (5) by mode and link.
 
-    K_ij: (nx, nx), H_ij: (nx, ny_j). Raises InputError where they do not fit.
+    K_ij: (nx, nx), H_ij: (nx, ny_j). `robust` says what is proved of the box `within`, as in `design`. Raises
+    InputError where they do not fit.
     """
     from designer import analysis
+    from designer.box.extent import asked
 
     wanted = find(problem)
     match gains:
@@ -69,14 +85,36 @@ def analyse(problem: Problem | Name, gains: Gains | Name | tuple[Links, Links]) 
             given = analysis.given_plain(wanted, K, H)
         case _:
             given = analysis.load_given(Path(gains), wanted)
-    return analysis.analyse(wanted, given)
+    return analysis.analyse(wanted, given, asked(wanted, _texts(within)))
 
 
-def verify(gains: Gains | Name) -> Proved:
-    """The certificate, proved again without a solver (`peakmesh verify`): `holds`, `gamma`, and why not."""
+class Proved(NamedTuple):
+    """What `peakmesh verify` has proved: first all that `--json` says by the same names."""
+
+    holds: bool
+    gamma: float
+    arithmetic: str
+    failure: str | None  # where it does not hold
+    margins: dict[str, float]  # of each inequality and mode
+    low: float | None  # the exact gain is not below it
+    low_is_false: bool  # gamma is proved, and the lower end that was claimed proved false
+    within: Robust | None  # its `gamma` is proved for every model of the box; None: no box
+
+
+def verify(gains: Gains | Name, *, within: Within | None = None, balls: bool = False) -> Proved:
+    """The certificate, proved again without a solver (`peakmesh verify`): `holds`, `gamma`, and why not.
+
+    `within`, as in `design`: what is proved of that box; without it that of the problem, of which what the file claims
+    has to be true. `balls`: in ball arithmetic alone. Raises InputError for a claim that cannot be about the problem.
+    """
+    from designer.box.claim import with_box
     from designer.proof.certificate import verify
+    from designer.proof.prover import BALLS, FLOATS
 
-    return verify(gains_of(gains))
+    found = gains_of(gains)
+    verdict = verify(found, makes=BALLS if balls else FLOATS + BALLS)
+    verdict, in_box = with_box(verdict, found, found.problem, _texts(within), balls=balls)
+    return Proved(**verdict._asdict(), within=in_box)
 
 
 def simulate(
@@ -136,6 +174,10 @@ def figures(*recordings: Name, width: float = 7.16, run: str | None = None) -> d
     found = {name: draw(width) for name, draw in drawings.items()}
     found["topologies"] = figures.topologies(account.log.gains.problem, width)
     return found | ({"ladder": figures.ladder(account.rungs, width)} if account.rungs else {})
+
+
+def _texts(within: Within | None) -> list[str]:
+    return [f"{names}={size}" for names, size in (within or {}).items()]
 
 
 def gains_of(gains: Gains | Name) -> Gains:

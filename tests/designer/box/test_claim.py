@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import peakmesh
 import pytest
 
 from agent.contract.errors import InputError
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
+from agent.contract.problem.matrices import Matrices
 from designer.analysis import certified, given
 from designer.box.claim import again, with_claim
 from designer.box.extent import box_in
 from designer.box.robust import robust
+from designer.box.worst import real_model
 from designer.cli import main
+from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, ladder_of
 from designer.problems.written import to_toml
+from designer.proof.ball_model import Truth
 
 
 def scalar(**more: Any) -> Problem:
@@ -132,3 +138,60 @@ def test_a_box_of_which_nothing_is_claimed_is_looked_at_and_fails_only_who_asked
     assert main(["verify", str(path)]) == 0
     assert "no gamma is proved for the box" in capsys.readouterr().out
     assert main(["verify", str(path), "--within", "A=30%"]) == 1
+
+
+# the library
+def test_the_library_designs_verifies_and_analyses_for_the_box_as_the_commands_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem, path, file = scalar(), tmp_path / "gains.json", tmp_path / "problem.toml"
+    file.write_text(to_toml(problem))
+    gains = peakmesh.design(problem, method="least-variance")
+    assert main(["design", str(file), "-o", str(path), "--json", "--method", "least-variance"]) == 0
+    by_command = Gains.load(path).certificate
+    said = json.loads(capsys.readouterr().out)
+    assert gains.certificate.box == by_command.box
+    assert gains.gamma == by_command.gamma
+
+    proved = peakmesh.verify(path)
+    assert proved.holds
+    assert proved.within is not None
+    assert proved.within.gamma == said["within"]["proved"] == by_command.box_gamma
+    assert main(["verify", str(path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said.keys() >= set(peakmesh.verify(path)._fields)
+    assert said["within"] == proved.within.document()
+
+    wider = {"probabilities": 0.05, "A,C": "2%"}
+    assert main(["verify", str(path), "--within", "probabilities=0.05", "--within", "A,C=2%", "--json"]) == 0
+    asked = peakmesh.verify(gains, within=wider).within
+    assert asked is not None
+    assert asked.document() == json.loads(capsys.readouterr().out)["within"]
+    analysed = peakmesh.analyse(problem, gains, within=wider).robust
+    assert analysed is not None
+    assert analysed.gamma == asked.gamma
+    with pytest.raises(InputError, match="is none of"):
+        peakmesh.design(problem, within={"E": 0.1})
+
+
+def test_the_library_refuses_a_claim_that_is_false(tmp_path: Path) -> None:
+    found = claimed().certificate.box.found  # type: ignore[union-attr]
+    proved = peakmesh.verify(edited(tmp_path, gamma=0.999 * found))  # type: ignore[operator]
+    assert not proved.holds
+    assert proved.failure is not None
+    assert "for every model of its box" in proved.failure
+
+
+def test_the_model_that_was_found_is_told_and_has_the_gain_that_is_said() -> None:
+    """From its numbers alone, by the recursion for one model."""
+    gains = claimed()
+    found = again(gains)
+    assert found is not None
+    told = found.document()["worst_model"]
+    matrices = Matrices(
+        *(np.array(told[letter]) for letter in "ABM"), *(tuple(map(np.array, told[letter])) for letter in "CD")
+    )
+    transition = [[Fraction(pi) for pi in row] for row in told["transition"]]
+    truth = Truth(np.array(told["arrival"]), np.array(told["delivery"]), transition, matrices, carry=True)
+    gain = exact_gain(real_model(gains.problem, gains.K, gains.H, truth))
+    assert gain.low == pytest.approx(found.found, rel=1e-4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -12,10 +13,12 @@ from outcomes import moment
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from designer.box.extent import Box, truth_at
-from designer.proof import cube
+from designer.proof import cube, vertices_by_balls
 from designer.proof.ball_model import told
-from designer.proof.cube import Cube
+from designer.proof.balls import exact
+from designer.proof.cube import Chosen, Cube, chosen
 from designer.proof.deviations import Deviations, Entry
+from designer.proof.float64 import Bounded
 
 ALONE = [  # one entry of every letter; node 1 sees its losses
     Entry("A", 0, 1, 0, 0.1),
@@ -103,14 +106,74 @@ def test_a_bound_that_forgets_a_term_is_none(monkeypatch: pytest.MonkeyPatch, en
     assert least(GAINS[False], (entry,)) < -1e-5
 
 
-def test_entries_of_one_column_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entries_of_one_column_add_up() -> None:
     """What two entries of a column are worth together must not be left out: deltas of 1, a of 0."""
-    from designer.proof.float64 import Bounded
-
     Q, radii = np.array([[[1.0, 0.9], [0.9, 1.0]]]), np.array([[1.0], [1.0]])
     S, a = Bounded(np.zeros((1, 1, 1)), np.zeros((1, 1))), np.zeros((1, 1, 2))
     right, wrong = (by(S, a, a, Q, radii, np.ones((1, 1, 1))).middle.item() for by in (ABOVE, only_by_itself))
     assert right >= 3.8 > wrong
+
+
+def with_too_little(by: Chosen) -> Chosen:
+    """Multipliers below Q: what is left of the entries has no largest value."""
+    return by._replace(Lambda=0.5 * by.Lambda)
+
+
+def with_the_wrong_sign(by: Chosen) -> Chosen:
+    return by._replace(Lambda=-by.Lambda)
+
+
+@pytest.mark.parametrize("mutant", [with_too_little, with_the_wrong_sign])
+def test_multipliers_that_bound_nothing_prove_nothing_in_floats_and_in_balls(
+    monkeypatch: pytest.MonkeyPatch, mutant: Callable[[Chosen], Chosen]
+) -> None:
+    """Two entries of a column, worth most to each other: there Lambda is near its least."""
+    Q, radii, X = np.array([[1.0, 0.9], [0.9, 1.0]]), np.array([[1.0], [1.0]]), np.ones((1, 1))
+    S, a = Bounded(np.zeros((1, 1, 1)), np.zeros((1, 1))), np.zeros((1, 1, 2))
+
+    def proved() -> list[bool]:
+        in_balls = vertices_by_balls.cubed(exact(S.middle[0]), exact(a[0]), exact(Q), radii, X)
+        return [cube.cubed(S, a, a, Q[None], radii, X[None]) is not None, in_balls is not None]
+
+    assert proved() == [True, True]
+    for module in (cube, vertices_by_balls):
+        monkeypatch.setattr(module, "chosen", lambda *of: mutant(chosen(*of)))
+    assert proved() == [False, False]
+
+
+def test_any_multipliers_bound_and_the_chosen_lose_least() -> None:
+    """Along X, of Lambda a tenth more or less in any row, as long as all is proved."""
+    rng = np.random.default_rng(5)
+    half = rng.normal(size=(4, 3))
+    a, Q, radii = rng.normal(size=(1, 5, 4)), 0.05 * (half @ half.T)[None], rng.uniform(0.1, 0.3, (4, 5))
+    half = rng.normal(size=(1, 5, 5))
+    X, S = half @ half.swapaxes(1, 2), np.zeros((1, 5, 5))
+    best = chosen(a, Q, radii, X)
+
+    def lost(by: Chosen) -> float:
+        found = a @ np.linalg.solve(by.rest(Q), a.swapaxes(1, 2))
+        return float((X * found).sum() + (X.diagonal(axis1=1, axis2=2) * cube.on_diagonal(by, radii)).sum())
+
+    assert lost(best) == pytest.approx(float((X * cube.weighed(S, a, Q, radii, X)).sum()))
+    for k in range(4):
+        for share in (0.9, 1.1):
+            Lambda = best.Lambda * np.where(np.arange(4) == k, share, 1.0)
+            assert lost(best) < lost(best._replace(Lambda=Lambda)) * (1.0 + 1e-3)
+
+
+def test_what_is_carried_is_the_slope_of_what_is_bounded() -> None:
+    """By Y, in any direction: the weights of a step lead to those of the step before."""
+    problem, gains = GAINS[False].problem, GAINS[False]
+    found = Cube(problem, gains.K, gains.H, told(problem)._replace(carry=True), TOGETHER)
+    rng = np.random.default_rng(6)
+    half, of_X = (
+        rng.normal(size=(2, found.order, found.order)),
+        rng.normal(size=(2, found.model.order, found.model.order)),
+    )
+    Y, X, by = half @ half.swapaxes(1, 2), of_X @ of_X.swapaxes(1, 2), rng.normal(size=half.shape)
+    by = by + by.swapaxes(1, 2)
+    ahead, behind = (float((X * found.weigh(Y + step * by, X)).sum()) for step in (1e-6, -1e-6))
+    assert (ahead - behind) / 2e-6 == pytest.approx(float((found.carry(Y, X) * by).sum()), rel=1e-4)
 
 
 @pytest.mark.parametrize("forgotten", ["mean", "noise"])
