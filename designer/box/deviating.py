@@ -1,4 +1,4 @@
-"""The worst entries of a box that are found: what the gain gains by each, of a model or of one that changes.
+"""The worst entries of a box that are found, of a constant model: what the gain gains by each.
 
 S(Y) of a model whose entries are off by D is S_0 + a D + D'a' + D'Q D (`designer.proof.cube`), so its derivative by D
 is 2 (a' + D'Q) X for what [eta; w] is like, X. All signs follow it at once, again and again: each D meets X alone, and
@@ -49,12 +49,12 @@ class _Steps(NamedTuple):
 
 def worst_constant(cube: Cube, low: float) -> Deviating:
     """All signs along the slope, then each alone, and so on; `low` is about the gain without deviations."""
-    best = ascended(cube, low, constant=True)
+    best = ascended(cube, low)
     for _ in range(_TURNS if len(cube.entries) <= _FEW_ENTRIES else 0):
         tried = _flipped(cube, best)
         if not tried.low > best.low:
             break
-        following = ascended(cube, tried.low, constant=True, start=tried)
+        following = ascended(cube, tried.low, tried)
         best = following if following.low > tried.low else tried
     return best
 
@@ -73,7 +73,7 @@ def _flipped(cube: Cube, at: Deviating) -> Deviating:
     return at
 
 
-def ascended(cube: Cube, low: float, *, constant: bool, start: Deviating | None = None) -> Deviating:
+def ascended(cube: Cube, low: float, start: Deviating | None = None) -> Deviating:
     """The worst that is met on the way from `start`, or from no deviation; `low` is about gamma there."""
     radii, modes, most = cube.deviations.radii, cube.model.modes, cube.deviations.of_M
     best = at = start or Deviating(0.0, np.zeros((_HORIZON, modes, *radii.shape)), np.zeros_like(most))
@@ -84,8 +84,7 @@ def ascended(cube: Cube, low: float, *, constant: bool, start: Deviating | None 
         if g > best.low**2:
             best = at._replace(low=math.sqrt(g))
         by_D, by_M = _slopes(cube, at, g * (1.0 + _WIDTH + _ABOVE))
-        if constant:
-            by_D = np.broadcast_to(by_D.sum(axis=(0, 1)), by_D.shape)
+        by_D = np.broadcast_to(by_D.sum(axis=(0, 1)), by_D.shape)  # one model in every step and mode
         D, of_M = (size * np.where(by > 0.0, 1.0, -1.0) for size, by in ((radii, by_D), (most, by_M)))
         if (D == at.D).all() and (of_M == at.of_M).all():
             break
