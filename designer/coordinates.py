@@ -48,15 +48,17 @@ class Coordinates:
     @classmethod
     def of(cls, problem: Problem) -> Coordinates | None:
         """In which no row of M cancels any more; None where none does, or nothing helps."""
-        found, taken = cls(problem, np.eye(problem.nx), fractions(np.eye(problem.nx))), np.zeros(problem.nx, dtype=bool)
-        while (row := _cancelling(found.problem, taken)) is not None:
+        found, there, taken = None, problem, np.zeros(problem.nx, dtype=bool)
+        T, inverse = np.eye(problem.nx), fractions(np.eye(problem.nx))
+        while (row := _cancelling(there, taken)) is not None:
             r, j = row
-            m = (fractions(problem.plant.M) @ found.inverse)[r]
-            undone, T = fractions(np.eye(problem.nx)), found.T.copy()
+            m, undone = (fractions(problem.plant.M) @ inverse)[r], fractions(np.eye(problem.nx))
             undone[j], T[j], taken[j] = -m / m[j], problem.plant.M[r], True
             undone[j, j] = 1 / m[j]
-            found = cls(problem, T, found.inverse @ undone)
-        return found if taken.any() else None
+            inverse = inverse @ undone
+            found = cls(problem, T.copy(), inverse)
+            there = found.problem
+        return found
 
     @cached_property
     def problem(self) -> Problem:
