@@ -72,12 +72,12 @@ def decay(L: Map, modes: int, units: Array, moves: NDArray[np.bool_] | None = No
 
 
 def is_positive(Z: Array) -> bool:
-    """Whether every Z(s) is positive definite, by Cholesky, in units in which its diagonal is 1."""
-    sizes = np.sqrt(np.abs(Z.diagonal(axis1=1, axis2=2)))
+    """Whether every Z (..., n, n) is positive definite, by Cholesky, in units in which its diagonal is 1."""
+    sizes = np.sqrt(np.abs(Z.diagonal(axis1=-2, axis2=-1)))
     if not (np.isfinite(Z).all() and (sizes > 0.0).all()):
         return False
     try:
-        np.linalg.cholesky(Z / sizes[:, :, None] / sizes[:, None])
+        np.linalg.cholesky(Z / sizes[..., :, None] / sizes[..., None, :])
     except np.linalg.LinAlgError:
         return False
     return True

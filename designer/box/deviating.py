@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.decay import is_positive
+from designer.box.passes import Steps, back, forth
 from designer.proof.cube import Cube
 
-_HORIZON = 60  # steps of a model that changes
+_HORIZON = 60  # steps
 _WIDTH = 5e-4  # of gamma^2, at which signs are compared
 _ABOVE = 0.01  # gamma^2 of the weights above that
 _ROUNDS = 8
@@ -25,26 +25,16 @@ _FAR = 1e8  # times gamma^2 of before: no gain
 
 
 class Deviating(NamedTuple):
-    """What the entries are off by, of every step from the last on and of every mode, and what gamma is at least."""
+    """What the entries are off by, and what gamma is at least."""
 
     low: float  # over so many steps, as far as floats tell
-    D: Array  # (T, modes, k, m)
+    D: Array  # (k, m)
     of_M: Array  # (nz, n_eta)
 
-    def signs(self, cube: Cube, step: int, mode: int) -> tuple[int, ...]:
-        """Of every entry there."""
+    def signs(self, cube: Cube) -> tuple[int, ...]:
+        """Of every entry."""
         every = zip(cube.entries, cube.deviations.places, strict=True)
-        return tuple(
-            int(np.sign((self.of_M if entry.matrix == "M" else self.D[step, mode])[place])) for entry, place in every
-        )
-
-
-class _Steps(NamedTuple):
-    """The recursion at some g, from the last step on."""
-
-    Y: Array  # (T, modes, n_eta, n_eta)
-    Gamma: Array
-    W_inverse: Array
+        return tuple(int(np.sign((self.of_M if entry.matrix == "M" else self.D)[place])) for entry, place in every)
 
 
 def worst_constant(cube: Cube, low: float) -> Deviating:
@@ -66,7 +56,7 @@ def _flipped(cube: Cube, at: Deviating) -> Deviating:
             break
         tried = at._replace(D=at.D.copy(), of_M=at.of_M.copy())
         of_letter = tried.of_M if entry.matrix == "M" else tried.D
-        of_letter[..., *place] *= -1.0
+        of_letter[place] *= -1.0
         g = at.low**2 * (1.0 + _WIDTH)
         if _recursion(cube, tried, g) is None:
             at = tried._replace(low=math.sqrt(_least(cube, tried, g)))
@@ -75,8 +65,8 @@ def _flipped(cube: Cube, at: Deviating) -> Deviating:
 
 def ascended(cube: Cube, low: float, start: Deviating | None = None) -> Deviating:
     """The worst that is met on the way from `start`, or from no deviation; `low` is about gamma there."""
-    radii, modes, most = cube.deviations.radii, cube.model.modes, cube.deviations.of_M
-    best = at = start or Deviating(0.0, np.zeros((_HORIZON, modes, *radii.shape)), np.zeros_like(most))
+    radii, most = cube.deviations.radii, cube.deviations.of_M
+    best = at = start or Deviating(0.0, np.zeros_like(radii), np.zeros_like(most))
     for _ in range(_ROUNDS):
         g = _least(cube, at, max(low, best.low) ** 2)
         if not math.isfinite(g):
@@ -84,7 +74,6 @@ def ascended(cube: Cube, low: float, start: Deviating | None = None) -> Deviatin
         if g > best.low**2:
             best = at._replace(low=math.sqrt(g))
         by_D, by_M = _slopes(cube, at, g * (1.0 + _WIDTH + _ABOVE))
-        by_D = np.broadcast_to(by_D.sum(axis=(0, 1)), by_D.shape)  # one model in every step and mode
         D, of_M = (size * np.where(by > 0.0, 1.0, -1.0) for size, by in ((radii, by_D), (most, by_M)))
         if (D == at.D).all() and (of_M == at.of_M).all():
             break
@@ -107,31 +96,15 @@ def _least(cube: Cube, at: Deviating, g: float) -> float:
     return low
 
 
-@np.errstate(all="ignore")  # what overflows is None
-def _recursion(cube: Cube, at: Deviating, g: float) -> _Steps | None:
-    n, passed = cube.order, []
+def _recursion(cube: Cube, at: Deviating, g: float) -> Steps | None:
     Y = np.tile(cube.peak_parts().at(at.of_M), (cube.model.modes, 1, 1))
-    for D in at.D:
-        S = cube.parts(Y).at(D)
-        W, cross = g * np.eye(S.shape[1] - n) - S[:, n:, n:], S[:, n:, :n]
-        if not (np.isfinite(S).all() and is_positive(W)):
-            return None
-        Gamma = np.linalg.solve(W, cross)
-        passed.append((Y, Gamma, np.linalg.inv(W)))
-        Y = S[:, :n, :n] + cross.swapaxes(1, 2) @ Gamma
-    return _Steps(*(np.array(part) for part in zip(*passed, strict=True)))
+    return back(lambda Y, steps: cube.parts(Y).at(at.D), Y, g, _HORIZON)
 
 
 def _slopes(cube: Cube, at: Deviating, g: float) -> tuple[Array, Array]:
     """Up to a factor the derivative of gamma by D and by what M is off."""
-    steps = _recursion(cube, at, g)
-    assert steps is not None  # g is above what holds
-    X, by_D = np.zeros_like(steps.Y[0]), np.zeros_like(at.D)
-    for k in range(len(at.D) - 1, -1, -1):
-        Gamma, D = steps.Gamma[k], at.D[k]
-        GX = Gamma @ X
-        V = steps.W_inverse[k] / np.abs(steps.W_inverse).max()
-        joint = np.block([[X, GX.swapaxes(1, 2)], [GX, GX @ Gamma.swapaxes(1, 2) + V]])
-        by_D[k] = cube.parts(steps.Y[k]).slope(D, joint)
-        X = cube.carried(joint, D)
-    return by_D, cube.peak_parts().slope(at.of_M, X.sum(axis=0))
+    passed = _recursion(cube, at, g)
+    assert passed is not None  # g is above what holds
+    joint, X = forth(passed.Gamma, passed.W_inverse, lambda joint, k: cube.carried(joint, at.D))
+    of_steps = [cube.parts(Y).slope(at.D, joint_k) for Y, joint_k in zip(passed.Y, joint, strict=True)]
+    return np.array(of_steps).sum(axis=(0, 1)), cube.peak_parts().slope(at.of_M, X.sum(axis=0))

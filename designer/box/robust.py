@@ -14,6 +14,7 @@ from agent.contract.errors import counted
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box, corners
+from designer.box.passes import step
 from designer.box.tail import invariant
 from designer.box.weights import Recipe, Round, mixed, moved, starts
 from designer.box.worst import There, Worst, worst
@@ -239,13 +240,12 @@ def _less(by: ByVertices, P: Array, low: float, best: float | None) -> float | N
 @np.errstate(all="ignore")  # what overflows does not end
 def ends(by: ByVertices, P: Array, g: float, most: int = _MOST_STEPS) -> bool:
     """Whether the recursion at g comes to Y < g P, as far as floats tell."""
-    Y, n = by.corners[0].ended(by.mean), by.order
+    Y = by.corners[0].ended(by.mean)
     for steps in range(most):
-        Z = by.upper(Y, steps)
-        W, cross = g * np.eye(Z.shape[1] - n) - Z[:, n:, n:], Z[:, n:, :n]
-        if not (np.isfinite(Z).all() and is_positive(W)):
+        taken = step(by.upper(Y, steps), by.order, g)
+        if taken is None:
             return False
-        Y = Z[:, :n, :n] + cross.swapaxes(1, 2) @ np.linalg.solve(W, cross)
+        Y = taken.Y
         if is_positive(g * P - Y):
             return True
     return False

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.contract.arrays import Array
-from designer.decay import is_positive
+from designer.box.passes import back, forth
 from designer.gain.exact import Operator, exact_gain
 from designer.gain.sensitivity import sweep
 from designer.model.error_model import ErrorModel
@@ -43,11 +43,8 @@ def weights_of(model: ErrorModel, above: float) -> Array | None:
     swept = sweep(operator, gain.high**2 * (1.0 + above), _HORIZON + _BEGINNING) if gain.stable else None
     if swept is None:
         return None
-    X, joint = np.zeros_like(swept.Y), []
-    for Gamma, W_inverse in zip(swept.Gamma[::-1], swept.W_inverse[::-1], strict=True):
-        joint.append(_joint(X, Gamma, W_inverse / np.abs(swept.W_inverse).max()))
-        X = operator.carry(joint[-1])
-    return _ridged(np.array(joint[::-1]))
+    joint, _ = forth(swept.Gamma, swept.W_inverse, lambda joint, k: operator.carry(joint))
+    return _ridged(joint)
 
 
 def mixed(weights: Array, tail: Array) -> Array:
@@ -84,34 +81,13 @@ def _measured(weights: Array, sizes: Array) -> Array:
     return np.asarray(weights / traces[:, None, None, None])
 
 
-@np.errstate(all="ignore")  # what overflows does not come so far
 def _of_bound(by: ByVertices, g: float) -> Array | None:
     """As `weights_of`, of what the recursion takes for S(Y) with the weights that it has."""
-    Y, n, passed = by.corners[0].ended(by.mean), by.order, []
-    for steps in range(_HORIZON + _BEGINNING):
-        Z = by.upper(Y, steps)
-        W, cross = g * np.eye(Z.shape[1] - n) - Z[:, n:, n:], Z[:, n:, :n]
-        if not (np.isfinite(Z).all() and is_positive(W)):
-            return None
-        Gamma, inverse = np.linalg.solve(W, cross), np.linalg.inv(W)
-        passed.append((Y, Gamma, inverse))
-        Y = Z[:, :n, :n] + cross.swapaxes(1, 2) @ Gamma
-    largest = max(float(np.abs(inverse).max()) for _, _, inverse in passed)
-    X, joint = np.zeros_like(Y), []
-    for Y, Gamma, inverse in reversed(passed):
-        joint.append(_joint(X, Gamma, inverse / largest))
-        X = by.carry(Y, joint[-1])
-    return _ridged(np.array(joint[::-1]))
-
-
-def _joint(X: Array, Gamma: Array, V: Array) -> Array:
-    """The mean of [eta; w][eta; w]' for w = Gamma eta and V beside it, (modes, n_eta + nw, n_eta + nw)."""
-    GX = Gamma @ X
-    top, bottom = (
-        np.concatenate([X, GX.swapaxes(1, 2)], axis=2),
-        np.concatenate([GX, GX @ Gamma.swapaxes(1, 2) + V], axis=2),
-    )
-    return np.concatenate([top, bottom], axis=1)
+    passed = back(by.upper, by.corners[0].ended(by.mean), g, _HORIZON + _BEGINNING)
+    if passed is None:
+        return None
+    joint, _ = forth(passed.Gamma, passed.W_inverse, lambda joint, k: by.carry(passed.Y[k], joint))
+    return _ridged(joint)
 
 
 def _ridged(joint: Array) -> Array:

@@ -126,7 +126,7 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
         if not (box.entries and math.isfinite(most)):
             break
         cube = Cube(problem, K, H, truth_at(problem, box, *_corner(at, split, last)), box.entries)
-        tried = at[:last] + list(worst_constant(cube, most).signs(cube, 0, 0))
+        tried = at[:last] + list(worst_constant(cube, most).signs(cube))
         gain = gain_at(tried)
         if not gain > most:
             break

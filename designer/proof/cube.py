@@ -25,6 +25,7 @@ from flint import ctx
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from designer.decay import is_positive
 from designer.proof.ball_model import BallModel, Truth
 from designer.proof.balls import UNDECIDED, Sign
 from designer.proof.by_floats import BITS, ByFloats
@@ -77,17 +78,10 @@ def chosen(a: Array, Q: Array, radii: Array, X: Array) -> Chosen:
         N = np.linalg.inv(theta[..., None] * np.eye(q.shape[-1]) - q)
         sizes = np.abs((N @ G @ N).diagonal(axis1=-2, axis2=-1))
         tried = theta + (np.sqrt(sizes) - 1.0) / N.diagonal(axis1=-2, axis2=-1)
-        if not _is_positive((1.0 - _INSIDE) * tried[..., None] * np.eye(q.shape[-1]) - q):
+        if not is_positive((1.0 - _INSIDE) * tried[..., None] * np.eye(q.shape[-1]) - q):
             break
         theta = tried
     return Chosen(xi, theta / e**2)
-
-
-def _is_positive(S: Array) -> bool:
-    try:
-        return bool(np.isfinite(np.linalg.cholesky(S)).all())
-    except np.linalg.LinAlgError:
-        return False
 
 
 def _positive(sizes: Array) -> Array:
@@ -134,6 +128,12 @@ def weighed(S: Array, a: Array, Q: Array, radii: Array, X: Array) -> Array:
     return np.asarray(found)
 
 
+def joined(X: Array, D: Array, V: Array | float = 0.0) -> Array:
+    """The mean of [v; p][v; p]' for p = D v with V beside it, where v has the mean X (modes, n, n) of v v'."""
+    DX = D @ X
+    return np.block([[X, DX.swapaxes(1, 2)], [DX, DX @ D.swapaxes(-1, -2) + V]])
+
+
 class _Lifted(NamedTuple):
     """E_l C_l and u_l over rows of eta+ and columns of [eta; w; p], in floats."""
 
@@ -157,7 +157,7 @@ class Parts(NamedTuple):
     Q: Array  # (modes, k, k)
 
     def at(self, D: Array) -> Array:
-        """For D (modes, k, m)."""
+        """For D (k, m)."""
         aD, D_T = self.a @ D, D.swapaxes(-1, -2)
         return np.asarray(self.S + aD + aD.swapaxes(-1, -2) + D_T @ self.Q @ D)
 
@@ -235,10 +235,8 @@ class Cube(ByFloats):
         return self.carried(X, np.asarray(np.linalg.solve(by.rest(Q), a.swapaxes(-1, -2)), dtype=np.float64))
 
     def carried(self, X: Array, D: Array) -> Array:
-        """The same where p = D [eta; w], D (modes, k, m)."""
-        DX, n = D @ X, self.model.size
-        joint = np.block([[X, DX.swapaxes(1, 2)], [DX, DX @ D.swapaxes(1, 2)]])
-        found = np.zeros((len(X), n, n))
+        """The same where p = D [eta; w], D (k, m), or one for each mode."""
+        joint, found = joined(X, D), np.zeros((len(X), self.model.size, self.model.size))
         for of_mode, joint_s, terms in zip(found, joint, self._lifted, strict=True):
             for term in terms:
                 moved = term.block @ joint_s[np.ix_(term.columns, term.columns)] @ term.block.T

@@ -72,8 +72,8 @@ def test_the_slope_by_an_entry_agrees_with_differences(monkeypatch: pytest.Monke
     gains, box = small()
     cube = cube_of(gains, box)
     monkeypatch.setattr(deviating, "_WIDTH", 1e-10)
-    shape = (20, cube.model.modes, *cube.deviations.radii.shape)
-    at = Deviating(0.0, np.zeros(shape), np.zeros_like(cube.deviations.of_M))
+    monkeypatch.setattr(deviating, "_HORIZON", 20)
+    at = Deviating(0.0, np.zeros_like(cube.deviations.radii), np.zeros_like(cube.deviations.of_M))
     g = deviating._least(cube, at, 100.0)
     by_D, by_M = deviating._slopes(cube, at, g * (1.0 + 1e-6))
 
@@ -81,15 +81,14 @@ def test_the_slope_by_an_entry_agrees_with_differences(monkeypatch: pytest.Monke
         ends = []
         for sign in (-1.0, 1.0):
             moved = at._replace(D=at.D.copy(), of_M=at.of_M.copy())
-            (moved.of_M if box.entries[entry].matrix == "M" else moved.D)[..., *cube.deviations.places[entry]] = (
-                sign * step
-            )
+            of_letter = moved.of_M if box.entries[entry].matrix == "M" else moved.D
+            of_letter[cube.deviations.places[entry]] = sign * step
             ends.append(deviating._least(cube, moved, g))
         return (ends[1] - ends[0]) / step
 
     slopes = []
     for entry, place in zip(box.entries, cube.deviations.places, strict=True):
-        slopes.append(float(by_M[place] if entry.matrix == "M" else by_D.sum(axis=(0, 1))[place]))
+        slopes.append(float(by_M[place] if entry.matrix == "M" else by_D[place]))
     chosen = [*np.argsort(-np.abs(slopes))[:3].tolist(), [entry.matrix for entry in box.entries].index("M")]
     ratios = [rise(k) / slopes[k] for k in chosen]
     assert ratios == pytest.approx([ratios[0]] * len(ratios), rel=0.02)
