@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,6 +99,22 @@ class Coordinates:
                 others = [a[i, j] * row[names[j]] for j in given.neighbours(s, i) if j != i]
                 closed[topology.name][receiver] = {**row, receiver: (A - sum(others)) / a[i, i]}
         return closed
+
+
+class There(NamedTuple):
+    """A problem and gains for it in which M does not cancel, of [T x; T e]; T None: as they were given."""
+
+    problem: Problem
+    K: LinkMatrices
+    H: LinkMatrices
+    T: Array | None
+
+    @classmethod
+    def of(cls, problem: Problem, K: LinkMatrices, H: LinkMatrices) -> There:
+        coordinates = Coordinates.of(problem)
+        if coordinates is None:
+            return cls(problem, K, H, None)
+        return cls(coordinates.problem, *coordinates.there(K, H), coordinates.T)
 
 
 def _cancelling(problem: Problem, taken: Any) -> tuple[int, int] | None:

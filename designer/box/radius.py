@@ -14,7 +14,7 @@ from designer.box.extent import Box, box_of, corners
 from designer.box.robust import ends
 from designer.box.tail import invariant
 from designer.box.weights import mixed, weights_of
-from designer.box.worst import There
+from designer.box.worst import real_model, there_of
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import told
@@ -103,7 +103,8 @@ def _work(problem: Problem, box: Box) -> float:
 def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> Radius:
     """Four times as large as long as floats see an end, then in halves until it is known to a fiftieth; then proved."""
     largest = shape.box(problem, _LARGEST)
-    nominal = There.of(problem, K, H, largest).model(told(problem)._replace(carry=largest.carry))
+    there, truth = there_of(problem, K, H, largest), told(problem)._replace(carry=largest.carry)
+    nominal = real_model(there.problem, there.K, there.H, truth)
     weights = weights_of(nominal, RAISED**2 - 1.0)
 
     def size(parts: int) -> Fraction:
@@ -141,7 +142,7 @@ def attempted(
     weights: Array,
 ) -> Attempt | None:
     """With the weights of the nominal model; None: as far as floats tell this gamma is not proved so."""
-    T = There.of(problem, K, H, box).T
+    T = there_of(problem, K, H, box).T
     models = [Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)]
     tail = invariant(ByVertices(models, weights), Operator(nominal))
     if tail is None:

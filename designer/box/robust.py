@@ -17,7 +17,7 @@ from designer.box.extent import Box, corners
 from designer.box.passes import step
 from designer.box.tail import invariant
 from designer.box.weights import Recipe, Round, mixed, moved, starts
-from designer.box.worst import There, Worst, worst
+from designer.box.worst import Worst, real_model, there_of, worst
 from designer.decay import is_positive
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
@@ -163,8 +163,10 @@ def _models(
 ) -> tuple[list[Cube], list[ErrorModel]]:
     """What stands at the corners, the likely worst first; and models whose worst w makes weights, the nominal last."""
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))
-    there = There.of(problem, K, H, box)
-    likely = [there.model(each) for each in (truth, told(problem)._replace(carry=box.carry))]
+    there = there_of(problem, K, H, box)
+    likely = [
+        real_model(there.problem, there.K, there.H, each) for each in (truth, told(problem)._replace(carry=box.carry))
+    ]
     return [Cube(problem, K, H, corner, box.entries, there.T) for corner in every], likely
 
 

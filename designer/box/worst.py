@@ -14,7 +14,7 @@ from agent.contract.problem import Problem
 from agent.contract.problem.matrices import matrices_of
 from designer.box.deviating import worst_constant
 from designer.box.extent import Box, truth_at
-from designer.coordinates import Coordinates
+from designer.coordinates import There
 from designer.gain.exact import exact_gain
 from designer.model.error_model import ErrorModel, stacked_links
 from designer.model.mismatch import Real, real_error_model
@@ -50,27 +50,9 @@ class Worst(NamedTuple):
         return found
 
 
-class There(NamedTuple):
-    """A problem and gains for it, of T x and T e, so that M does not cancel; T None: as they were given.
-
-    Where entries of matrices may be off they stay as they were: the entry of a state is no entry then.
-    """
-
-    problem: Problem
-    K: LinkMatrices
-    H: LinkMatrices
-    T: Array | None
-
-    @classmethod
-    def of(cls, problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> There:
-        coordinates = None if box.entries else Coordinates.of(problem)
-        if coordinates is None:
-            return cls(problem, K, H, None)
-        return cls(coordinates.problem, *coordinates.there(K, H), coordinates.T)
-
-    def model(self, truth: Truth) -> ErrorModel:
-        """The error model, in floats."""
-        return real_model(self.problem, self.K, self.H, truth)
+def there_of(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> There:
+    """All as it was where entries of matrices may be off: what is one among the states is none of T x."""
+    return There(problem, K, H, None) if box.entries else There.of(problem, K, H)
 
 
 def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
@@ -111,13 +93,13 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
     split, last = len(box.intervals), len(box.intervals) + len(box.rows)
     choices: list[list[int]] = [[0, 1]] * split + [list(range(len(rows))) for rows in box.rows]
     choices += [[-1, 1]] * len(box.entries)
-    there = There.of(problem, K, H, box)
+    there = there_of(problem, K, H, box)
 
     def truth(at: list[int]) -> Truth:
         return truth_at(problem, box, [bool(k) for k in at[:split]], at[split:last], at[last:])
 
     def gain_at(at: list[int]) -> float:
-        gain = exact_gain(there.model(truth(at)), width=_WIDTH)
+        gain = exact_gain(real_model(there.problem, there.K, there.H, truth(at)), width=_WIDTH)
         return gain.low if gain.stable else math.inf
 
     at = [0] * len(choices)

@@ -18,7 +18,7 @@ import numpy as np
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.coordinates import Coordinates
+from designer.coordinates import There
 from designer.gain.exact import InvariantSet, Operator, lyapunov
 from designer.gain.exact import step as backwards
 from designer.ledger.deviation import AS_DESIGNED, Acting, Deviation, Models, Unabsorbed
@@ -75,11 +75,10 @@ class Ledger:
         """For what the certificate of a gains file claims; where that stores no P, one is made here, in floats."""
         from designer.proof.certificate import lyapunov_matrix  # loads ball arithmetic
 
-        problem, K, H, T, P = gains.problem, gains.K, gains.H, None, None
+        problem, K, H, T = There(gains.problem, gains.K, gains.H, None)
+        P = None
         if gains.certificate.form == "summed":
-            coordinates = Coordinates.of(problem)
-            if coordinates is not None:
-                T, (K, H), problem = coordinates.T, coordinates.there(K, H), coordinates.problem
+            problem, K, H, T = There.of(problem, K, H)
             P, _ = lyapunov(Operator(error_model(problem, *stacked_links(problem, K, H))))
         if P is None:
             P = lyapunov_matrix(gains)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
-from designer.coordinates import Coordinates
+from designer.coordinates import There
 from designer.model.links import Innovations, LinkTerms, link_terms
 
 Indices = NDArray[np.intp]
@@ -244,10 +244,8 @@ def model_of_gains(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> ErrorM
 
     Where M cancels, eta = [T x; T e_1; ...; T e_n], of which it does not: designer.coordinates.
     """
-    coordinates = Coordinates.of(problem)
-    if coordinates is None:
-        return error_model(problem, *stacked_links(problem, K, H))
-    return error_model(coordinates.problem, *stacked_links(coordinates.problem, *coordinates.there(K, H)))
+    there = There.of(problem, K, H)
+    return error_model(there.problem, *stacked_links(there.problem, there.K, there.H))
 
 
 def initial_eta(problem: Problem) -> Array:

@@ -19,7 +19,7 @@ from designer.analysis import certified, given
 from designer.beyond_gamma import beyond_gamma
 from designer.box.extent import Box, box_of, corners, within
 from designer.box.robust import proved_at, robust
-from designer.box.worst import There, worst
+from designer.box.worst import there_of, worst
 from designer.coordinates import Coordinates, fractions
 from designer.gain.exact import Operator, exact_gain, lyapunov, node_gains
 from designer.gain.noise import long_run, steady_state
@@ -383,7 +383,7 @@ def test_an_entry_that_is_off_is_one_of_the_matrices_as_they_are(
     """So a box of entries is seen among the states, and T is refused for it."""
     problem, K, H, _ = boxed
     box = box_of(problem, within(["B=1%"]))
-    assert There.of(problem, K, H, box).T is None
+    assert there_of(problem, K, H, box).T is None
     with pytest.raises(ValueError, match="an entry that is off"):
         Cube(problem, K, H, corners(problem, box)[0], box.entries, np.eye(3))
 
