@@ -26,7 +26,7 @@ from agent.contract.recording import Logged
 from agent.contract.recording.evidence.examiner import Examiner, Findings
 from agent.contract.recording.ranges import ranges_of
 from agent.contract.recording.reader import Progress, RecordingReader
-from designer.replay.absences import Absences
+from designer.replay.absences import Absences, Void
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.central import Flags
 from designer.replay.part import Part
@@ -152,7 +152,7 @@ def _log(
         strange += unreadable.all()
     finished = end.get("status") == "finished" and not damages
     last = content.last()
-    expected = _integer(end, "steps", path=reader.path) if finished else last + 1
+    expected = _steps(end, planned, content.void(end), path=reader.path) if finished else last + 1
     if damages and end.get("status") == "finished" and end.get("steps") == str(planned):
         expected = max(last + 1, planned)
     if finished and expected != planned:
@@ -383,12 +383,12 @@ class _Content:
             events=np.array(self._events, dtype=np.int64)[first],
             event_copies=len(self._events) - len(first),
             recorded=recorded,
-            void=self._void(end),
+            void=self.void(end),
             unplanned=frozenset({PLANT_STATE} if without_plant else ()),
             excused=excused,
         )
 
-    def _void(self, end: dict[str, str]) -> dict[str, list[range]]:
+    def void(self, end: dict[str, str]) -> dict[str, list[range]]:
         """Of each sender, numbers that nobody looks for: they went with whoever held them; none in lock-step."""
         found = {key.removeprefix("void."): ranges_of(text) for key, text in end.items() if key.startswith("void.")}
         return found if self.is_paced else {}
@@ -398,7 +398,7 @@ class _Content:
         steps = len(self.columns["has"][:steps])
         if not self.is_paced:
             return Absences.none(steps, len(self.topics), len(self._external))
-        void = self._void(end)
+        void = self.void(end)
         accounted = self.examiner.whole.get(PLANT, 0) + sum(map(len, void.get(PLANT, ())))
         return Absences.of(
             self.topics,
@@ -475,6 +475,12 @@ def _external(reader: RecordingReader) -> tuple[bool, ...]:
     for name in names:
         problem.node_index(name)  # refuses a name that does not exist
     return tuple(name in names for name in problem.node_names)
+
+
+def _steps(end: dict[str, str], planned: int, void: Void, *, path: Path) -> int:
+    """Of a run that finished; the recorder says up to which nothing lacks, of what has gone with a process either."""
+    complete = _integer(end, "steps", path=path)
+    return planned if void else complete
 
 
 def _integer(metadata: dict[str, str], key: str, *, path: Path) -> int:

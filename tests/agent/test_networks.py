@@ -41,7 +41,7 @@ from agent.network.words import Refused
 from agent.pacing import beat
 from agent.plan import Pace, Plan
 from agent.roles import coordinator, node, suffering, timekeeper
-from designer.replay import absences, replay
+from designer.replay import absences, log, replay
 from designer.replay.absences import excused
 from designer.replay.coupling import Coupling
 from designer.replay.log import _Content
@@ -162,6 +162,10 @@ def _a_file_that_was_cut_lacks_no_reasons(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(_Content, "_gaps", lambda content: {})
 
 
+def _a_step_that_lacks_a_mode_is_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log, "_steps", lambda end, planned, void, *, path: int(end["steps"]))
+
+
 FOUND = {
     244: _what_is_lost_was_made_as_the_seed_says,
     541: _a_file_that_was_cut_lacks_no_reasons,
@@ -173,6 +177,7 @@ FOUND = {
     3222: _greeted_though_the_one_before_may_still_be_heard,
     4248: _plants_that_are_never_whole,
     4749: _greeted_though_the_one_before_may_still_be_heard,
+    5984: _a_step_that_lacks_a_mode_is_the_last,
     7097: _the_recorder_has_no_word_on_what_is_lost,
     7704: _succession_unseen,
     9833: _plants_that_are_never_whole,
