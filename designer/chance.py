@@ -14,6 +14,7 @@ from designer.start import value_of
 
 CONFIDENCE = 0.95  # of the bound that single runs keep
 _UP = Context(prec=4, rounding=ROUND_CEILING)
+_ROUNDED = 1.0 + 2.0**-30  # outweighs the rounding of a sum of 2^20 squares, and of all else here
 
 
 class Chance(NamedTuple):
@@ -24,7 +25,7 @@ class Chance(NamedTuple):
 
     def level(self, confidence: float = CONFIDENCE) -> float:
         """The c below which |z_tilde| stays at every step of a run with this probability at least."""
-        return float(self.gamma * np.sqrt(self.energy / (1.0 - confidence)) * (1.0 + 1e-15))
+        return float(self.gamma * np.sqrt(self.energy / (1.0 - confidence)) * _ROUNDED)
 
     def text(self) -> str:
         """For people."""

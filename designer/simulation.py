@@ -35,8 +35,8 @@ from agent.contract.problem.disturbance import White
 from agent.contract.schedule import DELIVERIES, DISTURBANCE, LOSSES, MODES, DisturbanceSource, Stream, normal
 from designer.gain.exact import Operator
 from designer.gain.noise import steady_state
-from designer.gain.start import left_by_start
 from designer.model.error_model import error_model, measurement_slices, model_of_gains, stacked_gains
+from designer.start import left_by_start
 from designer.workers import each
 
 CONFIDENCE = 0.99  # that the intervals of all steps hold at once
@@ -179,7 +179,7 @@ def simulate(
     assert found is not None
     start = left_by_start(gains.problem, gains.K, gains.H) if network.x.any() else 0.0
     if start is None:
-        raise InputError(f"what the initial error of {gains.problem.name} leaves at most was not found")
+        raise InputError(f"what the initial error of {gains.problem.name} leaves at most is not proved")
     ensemble = _ensemble(gains.certificate.gamma, found, _energy(network, steps), start)
     if ensemble.refuted_at is None:
         return ensemble

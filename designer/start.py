@@ -1,12 +1,14 @@
 """What an initial error adds to the guarantee: x(0) anywhere in |x_j(0)| <= initial_error_j, the nodes at 0.
 
 Two sentences, docs/theory.md, section 7. By the P of (17) and (18): E|z_tilde(k)|^2 <= gamma_P^2 (E sum |w|^2 + V),
-V = eta(0)'P(r(0))eta(0); proved. And since roots of mean squares add up at most (Minkowski), with the certified gamma,
-which may be far below gamma_P: (E|z_tilde(k)|^2)^(1/2) <= gamma (E sum |w|^2)^(1/2) + what x(0) alone leaves; computed.
+V = eta(0)'P(r(0))eta(0). And since roots of mean squares add up at most (Minkowski), with the certified gamma, which
+may be far below gamma_P: (E|z_tilde(k)|^2)^(1/2) <= gamma (E sum |w|^2)^(1/2) + what x(0) alone leaves. Both are
+proved.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -18,16 +20,17 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.coordinates import fractions
 from designer.gain.exact import exact_gain
-from designer.gain.start import corners, is_many, left_by_start
 from designer.ladder import rounded_up
 from designer.model.error_model import model_of_gains
 from designer.single_run import single_run_of
+
+_CORNERS = 10  # states whose signs are all tried; of more, each entry counts by its absolute value
 
 
 class FromStart(NamedTuple):
     """Of gains on a problem with an initial error; None where it was not found."""
 
-    alone: float | None  # (E|z_tilde(k)|^2)^(1/2) at most, at any step, where there is no w; computed
+    alone: float | None  # (E|z_tilde(k)|^2)^(1/2) at most, at any step, where there is no w; proved
     gamma_P: float | None  # of the P of the certificate, by (17) and (18); proved
     V: float | None  # eta(0)'P eta(0) at most; exact, rounded up
 
@@ -44,6 +47,28 @@ def from_start(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | No
     known = single_run_of(problem, K, H, gamma, P) if math.isfinite(gamma) else None
     gamma_P, V = (None, None) if known is None else (known.gamma, value_of(problem, known.P, known.T))
     return FromStart(left_by_start(problem, K, H), gamma_P, V)
+
+
+def left_by_start(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> float | None:
+    """The most that x(0) alone leaves of (E|z_tilde(k)|^2)^(1/2), at every step; None: not proved."""
+    from designer.proof.prover import Prover  # it loads ball arithmetic
+    from designer.proof.undisturbed import Starts
+
+    prover, s = Prover(problem, K, H), problem.mode_index(problem.markov.initial)
+    return prover.undisturbed(Starts(s, corners(problem), prover.T, by_size=is_many(problem)))
+
+
+def corners(problem: Problem) -> Array:
+    """The corners of |x_j| <= initial_error_j, of which -x is as good as x, (corners, nx)."""
+    if is_many(problem):
+        return np.abs(problem.initial_error)[None]
+    signs = itertools.product(*([(1.0,)] + [(1.0, -1.0)] * (problem.nx - 1)))
+    return np.array(list(signs)) * problem.initial_error
+
+
+def is_many(problem: Problem) -> bool:
+    """Whether there are too many corners: then |x|'|Y||x| at one of them is what none exceeds."""
+    return problem.nx > _CORNERS
 
 
 def value_of(problem: Problem, P: Array, T: Array | None = None) -> float:
@@ -70,8 +95,8 @@ def told(start: dict[str, Any] | None) -> list[str]:
     found = [
         "start      what x(0) within the initial error leaves was not found"
         if alone is None
-        else f"start      from x(0) within the initial error sqrt(E|z~|^2) <= gamma sqrt(E sum |w|^2) + {alone:.6g}, "
-        "of which the last is computed"
+        else "start      from x(0) within the initial error sqrt(E|z~|^2) <= gamma sqrt(E sum |w|^2) + "
+        f"{rounded_up(alone)}, of which the last is proved too"
     ]
     if gamma is not None:
         found.append(

@@ -62,7 +62,8 @@ ROOMS = {
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
     "designer.single_run": "designer.coordinates designer.gain designer.model designer.proof",
-    "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.single_run",
+    "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.proof "
+    "designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
     "designer.box": "designer.coordinates designer.decay designer.gain designer.invariants designer.ladder "
     "designer.model designer.proof designer.search",
@@ -79,11 +80,11 @@ ROOMS = {
     "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
     "designer.synthesis",
-    "designer.simulation": "designer.gain designer.model designer.workers",
+    "designer.simulation": "designer.gain designer.model designer.start designer.workers",
     "designer.ledger": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.chance": "designer.single_run designer.start",
-    "designer.replay": "agent.contract.recording designer.chance designer.gain designer.ledger designer.model "
-    "designer.proof",
+    "designer.replay": "agent.contract.recording designer.chance designer.ledger designer.model designer.proof "
+    "designer.start",
     "designer.identify": "designer.box designer.gain designer.model designer.replay",
     "designer.report": "designer.beyond_gamma designer.chance designer.ladder designer.model designer.proof "
     "designer.replay",

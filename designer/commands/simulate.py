@@ -55,7 +55,7 @@ def simulate_command(options: argparse.Namespace) -> int:
     (of w before the step, in the mean over white noise), bound (gamma^2 energy) and least (what the true mean is at
     least, whatever the distribution): the step of the largest mean, and that where the mean is largest relative to
     the bound (null where w is 0); start, what the initial error alone leaves of the root of the
-    mean square at most, computed; gain, the root of mean_square / energy at the closest (null with it, or a start);
+    mean square at most, proved; gain, the root of mean_square / energy at the closest (null with it, or a start);
     refuted
     (whether `least` is above the bound at some step) and refuted_at (the first such step, or null); single, of the
     largest |z_tilde(k)| in single runs the median, p95 and largest, bound (gamma times the root of all energy) and
@@ -163,6 +163,8 @@ def _step(ensemble: Ensemble, k: int) -> dict[str, Any]:
 
 
 def _text(facts: dict[str, Any]) -> str:
+    from designer.ladder import rounded_up
+
     peak, closest, single = facts["peak"], facts["closest"], facts["single"]
     root = "gamma sqrt(energy) + start" if facts["start"] else "gamma sqrt(energy)"
     bound = f"({root})^2" if facts["start"] else "gamma^2 energy"
@@ -173,7 +175,8 @@ def _text(facts: dict[str, Any]) -> str:
         f"peak       {_interval(peak, bound)}",
     ]
     if facts["start"]:
-        lines += [f"start      the initial error alone leaves {facts['start']:.6g} of sqrt(E|z~|^2) at most, computed"]
+        left = rounded_up(facts["start"])
+        lines += [f"start      the initial error alone leaves {left} of sqrt(E|z~|^2) at most, which is proved"]
     if facts["steady"] is not None:
         lines += [f"steady     mean |z~|^2 = {facts['steady']:.6g} in the long run, computed from this white noise"]
     if closest is None and facts["start"]:

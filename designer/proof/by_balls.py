@@ -74,6 +74,12 @@ class ByBalls:
         Y_next = [grown for _, grown in taken if grown is not None]
         return [found for found, _ in taken], Y_next if len(Y_next) == len(taken) else None
 
+    def undisturbed(self, Y: list[arb_mat]) -> list[arb_mat]:
+        """Not below L(Y): the step without w."""
+        eta = self.model.eta
+        with ctx.workprec(self.bits):
+            return [above(part(S, eta, eta)) for S in self.model.joint(Y)]
+
     def _step(self, S: arb_mat, g: arb, *, up: bool) -> tuple[Sign, arb_mat | None]:
         model = self.model
         W, cross = identity(model.nw) * g - part(S, model.w, model.w), part(S, model.eta, model.w)

@@ -111,6 +111,12 @@ class ByFloats:
         Y_next = quotient(J, W, np.array(least))
         return list(signs), None if Y_next is None else raised(Y_next, up=up)
 
+    @np.errstate(all="ignore")  # what is not finite decides nothing
+    def undisturbed(self, Y: Array) -> Array | None:
+        """Floats not below L(Y): the step without w."""
+        S, n = self.model.joint(Y), self.model.size
+        return None if S is None else raised(Bounded(S.middle[:, :n, :n], S.spread[:, :n]), up=True)
+
     def below(self, Y: Array, P: Array, gamma: float) -> list[Sign]:
         return self._less(Y, P, square(gamma, up=True))
 

@@ -18,6 +18,7 @@ from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
 from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_leaps, recursion
+from designer.proof.undisturbed import Starts, largest
 
 Make = Callable[..., Arithmetic]  # of a problem, K and H, and T
 
@@ -161,6 +162,16 @@ class Prover:
         if k and by.order > _LARGEST_RECURSION:
             return None
         return None if disproof(by, self._problem.mode_names, gamma, most=most, P=self.P) is None else by.name
+
+    def undisturbed(self, starts: Starts) -> float | None:
+        """Above what eta(0) alone leaves of (E|z_tilde(k)|^2)^(1/2) at any step; None: not proved."""
+        if self.P is None or not all(proved(answer.findings) for answer in self._stability):
+            return None
+        for by in (self._arithmetic(k) for k in range(len(self._makes))):
+            few = isinstance(by, ByFloats) or by.order <= _LARGEST_RECURSION
+            if few and isinstance(by, ByFloats | ByBalls) and (found := largest(by, self.P, starts)) is not None:
+                return found
+        return None
 
     @cached_property
     def stable(self) -> Stability:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from agent.contract.errors import InputError
 from agent.contract.extras import needing
 from agent.contract.gains import Gains
-from designer.gain.start import left_by_start
+from designer.start import left_by_start
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Gamma:
     is_claimed: bool
     failure: str | None  # why it is not proved
     is_proved: bool = False  # though something else that is claimed is false
-    start: float | None = 0.0  # sqrt E|z~|^2 that the initial error alone leaves at most, computed; None: not found
+    start: float | None = 0.0  # sqrt E|z~|^2 that the initial error alone leaves at most, proved; None: not found
     is_checked: bool = True  # what is needed for that is installed
 
     def text(self) -> str:

@@ -277,7 +277,7 @@ def test_what_an_initial_error_adds_is_what_sums_of_it_add() -> None:
     assert start.alone is not None
     assert start.gamma_P is not None
     assert start.V is not None
-    assert start.alone == pytest.approx(0.2 * math.sqrt(2.0), rel=1e-9)
+    assert start.alone == pytest.approx(0.2 * math.sqrt(2.0), rel=1e-8)
     assert start.gamma_P**2 * start.V >= start.alone**2
     assert exact_gain(model_of_gains(problem, *gains)).low < start.gamma_P < 1e-8
 

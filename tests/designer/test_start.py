@@ -14,14 +14,13 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.roles.plant import SimulatedPlant
 from designer.cli import main
-from designer.gain.start import left_by_start
 from designer.ledger.account import account
 from designer.model.error_model import error_model, initial_eta, link_gains, realised
 from designer.problems import find
 from designer.search.starts import least_variance_gains
 from designer.simulation import network_of, simulate, states
 from designer.single_run import single_run
-from designer.start import from_start, told, value_of
+from designer.start import from_start, left_by_start, told, value_of
 from designer.synthesis import design
 
 PENDULUM, LOSSY = find("inverted-pendulum"), find("zhu2020-lossy")
@@ -66,7 +65,7 @@ def test_where_a_corner_is_worse_than_the_given_one_it_counts() -> None:
         adjacency={"on": [[1.0]]},
     ).with_(plant={"initial_error": [1.0, -1.0]})
     K, H = {"on": {"a": {"a": np.diag([0.5, 0.5])}}}, {"on": {"a": {"a": np.zeros((2, 1))}}}
-    assert left_by_start(problem, K, H) == 2.0
+    assert left_by_start(problem, K, H) == pytest.approx(2.0, rel=1e-8)
     P = np.array([[[1.0, 0.25, 0.0, 0.0], [0.25, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]])
     assert value_of(problem, P) == math.nextafter(4.5, math.inf)
 

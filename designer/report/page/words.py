@@ -97,11 +97,10 @@ def error_sentence(account: Account) -> str:
     said = [f"{by_it} estimates of all nodes together were off by {brief(peak.size, 3)} at most, at step {peak.step}."]
     if account.mean_bound is not None:
         bound = float(account.mean_bound[-1])
-        start = f", but for {brief(verdict.gamma.start, 3)} that the start leaves" if verdict.gamma.start else ""
         above = "" if verdict.peak.size <= bound else " This run was above that, as single runs may be."
         said.append(
             f"Over many such runs the root of the mean square stays below {brief(bound, 3)} at every step; that is "
-            f"proved{start}.{above}"
+            f"proved.{above}"
         )
     else:
         said.append(f"No bound in the mean stands beside it: {_why_no_bound(account)}.")
