@@ -11,7 +11,7 @@ from agent.contract.problem import Problem
 from designer.box.extent import Box, asked, box_in, truth_at
 from designer.box.robust import Robust, proved_at, robust
 from designer.box.weights import Recipe, Round
-from designer.box.worst import Worst
+from designer.box.worst import Worst, gain_of
 from designer.proof.findings import Verdict
 
 
@@ -33,6 +33,7 @@ def with_claim(gains: Gains, found: Robust) -> Gains:
 def again(gains: Gains, *, balls: bool = False) -> Robust | None:
     """The claim of the file proved again, of the numbers and for the gamma that stand in it; None: it makes none.
 
+    By the weights whose recipe stands in the file, or where these prove nothing by those that a search finds here.
     Raises InputError where it cannot be about the problem in the file.
     """
     claim = gains.certificate.box
@@ -46,7 +47,13 @@ def again(gains: Gains, *, balls: bool = False) -> Robust | None:
     worst = Worst(truth, gain, claim.ends, claim.rows, claim.signs)
     recipe = Recipe(claim.start, tuple(Round(*each) for each in claim.rounds))
     verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, recipe, balls=balls)
-    return Robust(box, worst, verdict, recipe)
+    said = Robust(box, worst, verdict, recipe)
+    if said.gamma is not None or not gain_of(gains.problem, gains.K, gains.H, box, truth) <= claim.gamma:
+        return said
+    own = robust(gains.problem, gains.K, gains.H, box, balls=balls)
+    if own.gamma is None or own.gamma > claim.gamma:
+        return said
+    return own._replace(verdict=own.verdict and own.verdict._replace(gamma=claim.gamma))
 
 
 def with_box(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -10,19 +11,20 @@ from agent.contract.errors import InputError
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.uncertainty import Tolerance
-from designer.box.extent import Box, box_of, corners
-from designer.box.robust import ends
+from designer.box.extent import Box, box_of, corners, truth_at
+from designer.box.robust import models_of
+from designer.box.sought import ends, sought
 from designer.box.tail import invariant
 from designer.box.weights import mixed, weights_of
-from designer.box.worst import real_model, there_of
+from designer.box.worst import Worst, gain_of, real_model, there_of, worst
 from designer.gain.exact import Operator
-from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import told
 from designer.proof.by_vertices import ByVertices, prove
 from designer.proof.cube import Cube
 
 RAISED = 1.05
-_LARGEST, _PARTS = Fraction(1, 2), 1000  # sizes that are tried: parts of 0.5, so four decimals are all
+_LARGEST, _PARTS = Fraction(1, 2), 5000  # sizes that are tried: parts of 0.5, so four decimals are all
+_FIRST = 64  # of them
 _STEPS = 200  # in which the recursion has to end
 _FEW_NODES, _LITTLE = 8, 2e4  # of S(Y), at all corners and in all modes, a number for each row that meets another
 
@@ -101,28 +103,16 @@ def _work(problem: Problem, box: Box) -> float:
 
 
 def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> Radius:
-    """Four times as large as long as floats see an end, then in halves until it is known to a fiftieth; then proved."""
-    largest = shape.box(problem, _LARGEST)
-    there, truth = there_of(problem, K, H, largest), told(problem)._replace(carry=largest.carry)
-    nominal = real_model(there.problem, there.K, there.H, truth)
-    weights = weights_of(nominal, RAISED**2 - 1.0)
-
-    def size(parts: int) -> Fraction:
-        return _LARGEST * parts / _PARTS
-
-    def attempt(parts: int) -> Attempt | None:
-        box = shape.box(problem, size(parts))
-        return None if weights is None else attempted(problem, K, H, box, gamma, nominal, weights)
-
-    low, high = 0, 1
-    while high <= _PARTS and attempt(high) is not None:
-        low, high = high, min(4 * high, _PARTS) if high < _PARTS else _PARTS + 1
-    while high - low > max(1, low // 50):
-        middle = (low + high) // 2
-        low, high = (low, middle) if attempt(middle) is None else (middle, high)
-    while low and not ((found := attempt(low)) and prove(found.by, problem.mode_names, gamma, found.P).holds):
+    """As far as weights of the nominal model lead; from there as a box that is given is looked at; then proved."""
+    search = _Search(problem, K, H, shape, gamma)
+    low, high = search.further(*search.coarse())
+    while low and not ((found := search.attempt(low)) and prove(found.by, problem.mode_names, gamma, found.P).holds):
         low, high = low - 1, low
-    return Radius(shape, gamma, float(size(low)), float(size(high)) if high <= _PARTS else None)
+    return Radius(shape, gamma, float(_size(low)), float(_size(high)) if high <= _PARTS else None)
+
+
+def _size(parts: int) -> Fraction:
+    return _LARGEST * parts / _PARTS
 
 
 class Attempt(NamedTuple):
@@ -132,21 +122,66 @@ class Attempt(NamedTuple):
     P: Array
 
 
-def attempted(
-    problem: Problem,
-    K: LinkMatrices,
-    H: LinkMatrices,
-    box: Box,
-    gamma: float,
-    nominal: ErrorModel,
-    weights: Array,
-) -> Attempt | None:
-    """With the weights of the nominal model; None: as far as floats tell this gamma is not proved so."""
-    T = there_of(problem, K, H, box).T
-    models = [Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)]
-    tail = invariant(ByVertices(models, weights), Operator(nominal))
-    if tail is None:
-        return None
-    P, X = tail
-    by = ByVertices(models, mixed(weights, X) if box.entries else weights, X)
-    return Attempt(by, P) if ends(by, P, gamma**2, _STEPS) else None
+class _Search:
+    """The sizes of one shape that floats see an end of the recursion for, in parts."""
+
+    def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> None:
+        self.problem, self.K, self.H, self.shape, self.gamma = problem, K, H, shape, gamma
+        largest = shape.box(problem, _LARGEST)
+        there, truth = there_of(problem, K, H, largest), told(problem)._replace(carry=largest.carry)
+        self.nominal = real_model(there.problem, there.K, there.H, truth)
+        self.weights = weights_of(self.nominal, RAISED**2 - 1.0)
+        self._worst: Worst | None = None
+
+    def coarse(self) -> tuple[int, int]:
+        """One size with an end and the next without, a fiftieth apart: four times as large, and then in halves."""
+        low, high = 0, _FIRST
+        while high <= _PARTS and self.plainly(high) is not None:
+            low, high = high, min(4 * high, _PARTS) if high < _PARTS else _PARTS + 1
+        return _halved(low, high, self.plainly)
+
+    def further(self, low: int, high: int) -> tuple[int, int]:
+        """The same by better weights, beginning there."""
+        if high > _PARTS:
+            return low, high
+        while high <= _PARTS and self.by_rounds(high) is not None:
+            low, high = high, min(high + max(1, high // 10), _PARTS) if high < _PARTS else _PARTS + 1
+        return _halved(low, high, self.by_rounds)
+
+    def attempt(self, parts: int) -> Attempt | None:
+        return self.plainly(parts) or self.by_rounds(parts)
+
+    def plainly(self, parts: int) -> Attempt | None:
+        """With the weights of the nominal model; None: as far as floats tell gamma is not proved so."""
+        if self.weights is None:
+            return None
+        box = self.shape.box(self.problem, _size(parts))
+        T = there_of(self.problem, self.K, self.H, box).T
+        models = [Cube(self.problem, self.K, self.H, corner, box.entries, T) for corner in corners(self.problem, box)]
+        tail = invariant(ByVertices(models, self.weights), Operator(self.nominal))
+        if tail is None:
+            return None
+        P, X = tail
+        by = ByVertices(models, mixed(self.weights, X) if box.entries else self.weights, X)
+        return Attempt(by, P) if ends(by, P, self.gamma**2, _STEPS) else None
+
+    def by_rounds(self, parts: int) -> Attempt | None:
+        """With those that `designer.box.robust` finds; None as well where the model that is worst has more."""
+        box, gamma = self.shape.box(self.problem, _size(parts)), self.gamma
+        if self._worst is None:  # other sizes are likely to have theirs in the same corner
+            self._worst = worst(self.problem, self.K, self.H, box)
+        rows = [min(k, len(found) - 1) for k, found in zip(self._worst.rows, box.rows, strict=True)]
+        truth = truth_at(self.problem, box, self._worst.ends, rows, self._worst.signs)
+        models, likely = models_of(self.problem, self.K, self.H, box, truth)
+        if not gain_of(self.problem, self.K, self.H, box, truth) < gamma:
+            return None
+        least = sought(models, likely, gamma**2, enough=gamma**2)
+        return None if least is None or least.g > gamma**2 else Attempt(least.by, least.P)
+
+
+def _halved(low: int, high: int, attempt: Callable[[int], Attempt | None]) -> tuple[int, int]:
+    """Known to a fiftieth."""
+    while high - low > max(1, low // 50):
+        middle = (low + high) // 2
+        low, high = (low, middle) if attempt(middle) is None else (middle, high)
+    return low, high

@@ -99,8 +99,7 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
         return truth_at(problem, box, [bool(k) for k in at[:split]], at[split:last], at[last:])
 
     def gain_at(at: list[int]) -> float:
-        gain = exact_gain(real_model(there.problem, there.K, there.H, truth(at)), width=_WIDTH)
-        return gain.low if gain.stable else math.inf
+        return _gain(there, truth(at))
 
     at = [0] * len(choices)
     at, most = _ascent(gain_at, at, gain_at(at), choices[:last])
@@ -114,6 +113,16 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
             break
         at, most = _ascent(gain_at, tried, gain, choices[:last])
     return Worst(truth(at), most, *_corner(at, split, last), tuple(at[last:]))
+
+
+def gain_of(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth: Truth) -> float:
+    """The exact gain of one model, from below; infinite: not mean-square stable."""
+    return _gain(there_of(problem, K, H, box), truth)
+
+
+def _gain(there: There, truth: Truth) -> float:
+    gain = exact_gain(real_model(there.problem, there.K, there.H, truth), width=_WIDTH)
+    return gain.low if gain.stable else math.inf
 
 
 def _corner(at: list[int], split: int, last: int) -> tuple[tuple[bool, ...], tuple[int, ...]]:

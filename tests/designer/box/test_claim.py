@@ -17,6 +17,7 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.problem.matrices import Matrices
 from designer.analysis import certified, given
+from designer.box import claim
 from designer.box.claim import again, with_claim
 from designer.box.extent import box_in
 from designer.box.robust import robust
@@ -80,6 +81,19 @@ def test_balls_prove_the_same_claim() -> None:
     assert found is not None
     assert found.gamma == claimed().certificate.box_gamma
     assert "ball arithmetic" in found.verdict.arithmetic  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("changes", [{"rounds": []}, {"rounds": [], "signs": [1, -1, 1], "ends": [True]}, {"start": 7}])
+def test_where_the_file_does_not_say_how_weights_are_made_they_are_sought(
+    changes: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or says it wrongly: what stands there alone proves nothing, and the claim is as true as before."""
+    path, gamma = edited(tmp_path, **changes), claimed().certificate.box_gamma
+    assert main(["verify", str(path)]) == 0
+    assert f"gamma = {gamma} is proved for every model of the box" in capsys.readouterr().out
+    assert main(["verify", str(edited(tmp_path, **changes, gamma=0.9999 * gamma))]) == 1  # type: ignore[operator]
+    monkeypatch.setattr(claim, "robust", lambda *_, **__: again(claimed())._replace(verdict=None))  # type: ignore[union-attr]
+    assert main(["verify", str(path)]) == 1
 
 
 @pytest.mark.parametrize("balls", [[], ["--balls"]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 
 import numpy as np
@@ -18,8 +19,9 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.problem.matrices import Matrices
 from designer.box.extent import Box, box_of, corners, truth_at, within
-from designer.box.radius import radii
+from designer.box.radius import Shape, _Search, radii
 from designer.box.robust import Robust, robust
+from designer.box.worst import worst
 from designer.cli import main
 from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, Ladder
@@ -260,6 +262,22 @@ def test_the_radius_is_proved_and_not_far_from_where_a_model_exceeds_it() -> Non
     assert lasts(gains, [truth_at(problem, box, [False], [0])] * 200, radius.gamma)
     assert not lasts(gains, [truth_at(problem, further, [False], [0])] * 200, radius.gamma)
     assert f"for {radius.beyond:.4f} that was not proved" in radius.line()
+
+
+def test_rounds_of_weights_take_the_radius_further_and_not_beyond_a_model_that_has_more() -> None:
+    gains = random_gains(real_problem(4, unbiased=False, links=False, ny=(1, 1), modes=1))
+    problem, shape = gains.problem, Shape(("A", "B", "C", "D"), relative=True)
+    gamma = 1.05 * exact_gain(error_model(problem, *stacked_gains(gains))).high
+    search = _Search(problem, gains.K, gains.H, shape, gamma)
+    plainly, beyond = search.coarse()
+    low, high = search.further(plainly, beyond)
+    assert low >= 1.05 * plainly
+    assert search.plainly(low) is None
+    found = search.by_rounds(low)
+    assert found is not None
+    assert prove(found.by, problem.mode_names, gamma, found.P).holds
+    box = shape.box(problem, Fraction(high, 10_000) * Fraction(11, 10))
+    assert worst(problem, gains.K, gains.H, box).gain > gamma
 
 
 def test_the_commands_print_the_rungs_and_say_no(capsys: pytest.CaptureFixture[str]) -> None:
