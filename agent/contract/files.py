@@ -59,8 +59,12 @@ def writing_whole(path: Path, *, force: bool = False) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+class RepeatedKey(ValueError):
+    """A key is there twice, of which readers take one or the other."""
+
+
 def read_json(data: bytes) -> Any:
-    """What JSON says. ValueError: it is none, or says a key twice, of which readers take one or the other."""
+    """What JSON says. ValueError: it is none, or a RepeatedKey."""
     return json.loads(data, object_pairs_hook=_without_repeats)
 
 
@@ -69,7 +73,7 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         repeated = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {shortened(repeated)} is there {names.count(repeated)} times; keep one of them")
+        raise RepeatedKey(f"the key {shortened(repeated)} is there {names.count(repeated)} times; keep one of them")
     return found
 
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
 from agent.contract.errors import InputError, listed
-from agent.contract.files import kind_of, read_bytes, read_json, write_whole
+from agent.contract.files import RepeatedKey, kind_of, read_bytes, read_json, write_whole
 from agent.contract.problem import Problem
 from agent.contract.tables import table
 
@@ -148,7 +148,8 @@ class Gains(Model):
             document = read_json(data)
         except (ValueError, RecursionError) as error:
             kind = kind_of(data)
-            why = f"it is {kind}" if kind in ("a recording", "a problem file") else f"it is not valid JSON: {error}"
+            why = str(error) if isinstance(error, RepeatedKey) else f"it is not valid JSON: {error}"
+            why = f"it is {kind}" if kind in ("a recording", "a problem file") else why
             hint = f"; design it first: peakmesh design {source}" if kind == "a problem file" else ""
             raise InputError(f"{source} is not a gains file: {why}{hint}") from None
         if not isinstance(document, dict) or document.get("format") != FORMAT:

@@ -21,7 +21,7 @@ PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
     "exact": "mean-square stability by (17), and gamma by the recursion of the exact gain",
 }
-_BESIDE = {"name", "disturbance", "tolerance"}  # what a proof of gamma does not depend on
+_BESIDE = {"name", "disturbance", "tolerance", "initial", "initial_error"}  # what a proof of gamma does not depend on
 
 
 def add_verify(commands: Subcommands) -> None:
@@ -93,7 +93,7 @@ def verify_command(options: argparse.Namespace) -> int:
         lines += [f"claimed {text}" for text in _claimed(gains, verdict.low, least)]
     else:
         no = f"gamma = {verdict.gamma} is not proved for {options.gains}: {verdict.failure}"
-        if verdict.low_is_false:
+        if verdict.interval_is_false:
             false = f"{options.gains} says what is proved false: {verdict.failure}"
             no = f"{false}; gamma = {verdict.gamma} itself is proved"
         lines = [f"does not hold: {no}", *lines]
@@ -107,9 +107,20 @@ def _differences(found: Problem, wanted: Problem) -> list[str]:
     def differing(one: dict[str, Any], other: dict[str, Any]) -> set[str]:
         return {key for key in one.keys() | other.keys() if one.get(key) != other.get(key)}
 
-    differs = differing(found.certain().document(), wanted.certain().document())
-    more = differing(found.document(), wanted.document()) - differs
+    differs = differing(_parts(found.certain()), _parts(wanted.certain()))
+    more = differing(_parts(found), _parts(wanted)) - differs
     return sorted(differs | ({"tolerance"} if more else set()))
+
+
+def _parts(problem: Problem) -> dict[str, Any]:
+    """The document, and by itself what gamma is for any of; links that lose nothing are none."""
+    document = problem.document()
+    lossy = [link for link in document.get("link") or () if link["delivery_probability"] < 1.0 or "tolerance" in link]
+    beside = {
+        "initial": document["markov"].pop("initial"),
+        "initial_error": document["plant"].pop("initial_error", None),
+    }
+    return {**document, **beside, "link": lossy}
 
 
 def _for_another(gains: Gains, options: argparse.Namespace, differs: list[str]) -> int:

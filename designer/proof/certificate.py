@@ -29,21 +29,23 @@ def verify(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Verdict:
         raise InputError(f"certificate: horizon is {most}; a proof takes from 1 to {MOST_STEPS} steps")
     if claim.kind == "lyapunov":
         return prover.theorem1(claim.gamma)
-    verdict = _with_lower_end(claim, prover, prover.exact(claim.gamma, most=MOST_STEPS if most is None else most))
+    verdict = _with_interval(claim, prover, prover.exact(claim.gamma, most=MOST_STEPS if most is None else most))
     return verdict if claim.theorem1_gamma is None else verdict.joined(prover.theorem1(claim.theorem1_gamma))
 
 
-def _with_lower_end(claim: Certificate, prover: Prover, verdict: Verdict) -> Verdict:
-    """That the exact gain is not below the lower end that the file gives: proved, left open, or proved false."""
+def _with_interval(claim: Certificate, prover: Prover, verdict: Verdict) -> Verdict:
+    """That the exact gain is where the file says: proved of both ends, left open, or proved false of one."""
     if claim.exact is None or not verdict.holds:
         return verdict
-    low = claim.exact[0]
-    if low <= claim.gamma and (low <= 0.0 or prover.at_least(low) is not None):
-        return verdict._replace(low=low)
-    if low > claim.gamma or prover.exact(low).holds:
+    (low, high), why = claim.exact, None
+    ends = high >= claim.gamma or prover.exact(high).holds
+    if not ends and prover.at_least(high) is not None:
+        why = f"the exact gain is not below {high}, where the file says it ends"
+    elif low <= claim.gamma and (low <= 0.0 or prover.at_least(low) is not None):
+        return verdict._replace(low=low) if ends else verdict
+    elif low > claim.gamma or prover.exact(low).holds:
         why = f"the exact gain is below {low}, where the file says it begins"
-        return verdict._replace(holds=False, failure=why, low_is_false=True)
-    return verdict
+    return verdict if why is None else verdict._replace(holds=False, failure=why, interval_is_false=True)
 
 
 def prover_of(gains: Gains, *, makes: Sequence[Make] = FLOATS + BALLS) -> Prover:

@@ -16,7 +16,7 @@ class Verdict(NamedTuple):
     failure: str | None
     margins: dict[str, float]  # of each inequality and mode: the least eigenvalue after scaling; not proved: <= 0
     low: float | None = None  # the exact gain is not below it, which is proved too; None: nobody said, or it is not
-    low_is_false: bool = False  # gamma is proved, and the lower end that was claimed proved false
+    interval_is_false: bool = False  # gamma is proved, and an end that was claimed of the exact gain proved false
 
     def joined(self, other: Verdict) -> Verdict:
         """Both, with this one's gamma."""

@@ -52,5 +52,5 @@ def checked_gamma(gains: Gains) -> Gamma:
             return Gamma(claim.gamma, is_claimed=True, failure=str(error), is_checked=False)
         return Gamma(claim.gamma, is_claimed=True, failure=str(error))
     start = 0.0 if problem.plant.initial_error is None else left_by_start(problem, gains.K, gains.H)
-    is_proved = verdict.holds or verdict.low_is_false
+    is_proved = verdict.holds or verdict.interval_is_false
     return Gamma(claim.gamma, is_claimed=True, failure=verdict.failure, is_proved=is_proved, start=start)

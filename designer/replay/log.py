@@ -29,9 +29,10 @@ from agent.contract.recording.reader import Progress, RecordingReader
 from designer.replay.absences import Absences, Void
 from designer.replay.census import Census, Facts, take_census
 from designer.replay.central import Flags
+from designer.replay.growing import largest_followed
 from designer.replay.part import Part
 from designer.replay.said import Said
-from designer.replay.topics import GROWN, Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
+from designer.replay.topics import Columns, Numbers, Senders, Sentences, Topic, Words, topics_of
 
 _MEMORY = 2.0  # seconds, and two steps, after which a node has said why it substituted something
 _NAMED = 3  # so many damages and topics are named
@@ -253,6 +254,7 @@ class _Content:
         self.topics, self.columns = topics_of(gains.problem, external, planned=planned, paced=self.is_paced)
         memory = 2 + math.ceil(_MEMORY / period) if period else 0
         self.said = Said(gains.problem.node_names, memory=memory)
+        self._followed = largest_followed(gains)
         self.messages = 0
         names = gains.problem.node_names
         self.examiner = Examiner(external=[name for name, real in zip(names, external, strict=True) if real])
@@ -329,9 +331,9 @@ class _Content:
         large = np.zeros(len(self.columns["has"]), dtype=bool)
         for topic in self.topics.values():
             for name, place in topic.places.items():
-                if name in ("x", "x_hat"):
+                if name in ("x", "w", "x_hat"):
                     has = self.columns["has"][:, topic.place]
-                    large[has] |= (np.abs(self.columns[name][has, place]) > GROWN).any(axis=1)
+                    large[has] |= (np.abs(self.columns[name][has, place]) > self._followed).any(axis=1)
         return int(np.argmax(large)) if large.any() else None
 
     def beyond(self, grown: int | None) -> list[str]:

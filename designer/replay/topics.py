@@ -23,7 +23,6 @@ from agent.contract.recording import Logged
 
 Numbers = NDArray[np.int64]
 
-GROWN = 1e130  # of a state that has grown so far, the next may be beyond it
 NAMED = 20  # so many faults of a kind are named, the others counted
 _ROWS = 1 << 20  # of the columns at first, where the run has so many steps
 _STAMP = ("number", "time")  # columns that are not of a message's content

@@ -97,7 +97,7 @@ class Proved(NamedTuple):
     failure: str | None  # where it does not hold
     margins: dict[str, float]  # of each inequality and mode
     low: float | None  # the exact gain is not below it
-    low_is_false: bool  # gamma is proved, and the lower end that was claimed proved false
+    interval_is_false: bool  # gamma is proved, and an end that was claimed of the exact gain proved false
     within: Robust | None  # its `gamma` is proved for every model of the box; None: no box
 
 

@@ -8,11 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 from made_recordings import record, simulate
+from networks import random_problem
 from places import ROOT
 
 from agent.contract.gains import Gains
+from agent.contract.problem import Problem
 from designer.cli import main
 from designer.commands import design as design_command
+from designer.commands.verify import _differences
 from designer.problems import find, names
 from designer.replay.gamma import checked_gamma
 from designer.reproduce import EXAMPLES, Reproduced
@@ -80,13 +83,31 @@ def test_verify_says_of_which_problem(folder: Path, capsys: pytest.CaptureFixtur
     assert run("verify", "false.json", "other.toml") == 0
 
 
-def test_no_proof_depends_on_a_name(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_proof_depends_on_a_name_or_on_the_beginning(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """gamma is beside what an initial error leaves."""
     assert run("design", "two-nodes", "-o", "gains.json") == 0
     text = (ROOT / "designer" / "problems" / "two-nodes.toml").read_text()
-    Path("renamed.toml").write_text(text.replace('name = "two-nodes"', 'name = "renamed"', 1))
-    capsys.readouterr()
-    assert run("verify", "gains.json", "renamed.toml") == 0
-    assert 'differs from the one given in "name", on which no proof depends' in capsys.readouterr().out
+    for changed, by, said in (
+        ('name = "two-nodes"', 'name = "renamed"', '"name"'),
+        ("[plant]\n", "[plant]\ninitial_error = [0.1]\n", '"initial_error"'),
+    ):
+        assert changed in text
+        Path("other.toml").write_text(text.replace(changed, by, 1))
+        capsys.readouterr()
+        assert run("verify", "gains.json", "other.toml") == 0
+        assert f"differs from the one given in {said}, on which no proof depends" in capsys.readouterr().out
+
+
+def test_of_which_problem_gamma_is() -> None:
+    """It is from any first mode; a link that loses nothing is none, one that loses a little is one."""
+    problem = random_problem(0, modes=2)
+    other = next(name for name in problem.mode_names if name != problem.markov.initial)
+    assert _differences(problem, problem.with_(markov={"initial": other})) == ["initial"]
+    i = next(i for i in range(problem.n) if len(problem.ever_heard(i)) > 1)
+    receiver, sender = problem.node_names[i], problem.node_names[next(j for j in problem.ever_heard(i) if j != i)]
+    for probability, differs in ((1.0, []), (1.0 - 2.0**-53, ["link"])):
+        link = {"receiver": receiver, "sender": sender, "delivery_probability": probability}
+        assert _differences(problem, Problem.from_document(problem.document() | {"link": [link]})) == differs
 
 
 def test_a_lower_end_that_is_false_leaves_gamma_proved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

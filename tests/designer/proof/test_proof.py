@@ -471,12 +471,12 @@ def test_gains_that_are_not_stable_have_no_P(makes: Sequence[Make]) -> None:
 @every_arithmetic
 @every_network
 def test_the_interval_of_the_exact_gain_is_proved(network: str, makes: Sequence[Make]) -> None:
-    """Both ends; a lower end that is too high by 1e-5 is proved false where gamma itself allows for it."""
+    """Both ends; one that is off by 1e-5 in the wrong direction is proved false, though gamma itself allows for it."""
     gains = ALL[network, "exact"]
     low, high = gains.certificate.exact or (0.0, 0.0)
     proved = low * (1.0 - 1e-9)
 
-    def saying(low: float, gamma: float = high) -> Verdict:
+    def saying(low: float, gamma: float = high, high: float = high) -> Verdict:
         claim = gains.certificate.model_copy(update={"exact": (low, high), "gamma": gamma})
         return verify(gains.model_copy(update={"certificate": claim}), makes=makes)
 
@@ -486,8 +486,14 @@ def test_the_interval_of_the_exact_gain_is_proved(network: str, makes: Sequence[
         f"the exact gain is below {high * (1.0 + 1e-5)}, where the file says it begins"
     )
     assert not saying(high * (1.0 + 1e-5)).holds
-    assert saying(high * (1.0 + 1e-5), 2.0 * high).low_is_false
-    assert not saying(proved, 0.9 * high).low_is_false
+    assert saying(high * (1.0 + 1e-5), 2.0 * high).interval_is_false
+    assert not saying(proved, 0.9 * high).interval_is_false
+    assert saying(proved, 2.0 * high).low == proved
+    ended = low * (1.0 - 1e-5)
+    assert saying(0.9 * low, high=ended).failure == (
+        f"the exact gain is not below {ended}, where the file says it ends"
+    )
+    assert saying(proved, high=ended).interval_is_false
 
 
 def test_what_no_w_attains_is_not_proved_to_be_attained(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,11 +28,11 @@ def cancelling(part: float, **disturbance: object) -> Gains:
     )
 
 
-def growing(a: float) -> Gains:
+def growing(a: float, *, C: float = 1.0, M: float = 1.0) -> Gains:
     """One node of an unstable plant."""
-    node = {"C": [[1.0]], "D": [[0.0, 0.3]], "arrival_probability": 0.9, "loss": "seen"}
-    plant = {"A": [[a]], "B": [[1.0, 0.0]], "M": [[1.0]]}
-    return single(plant, node, np.array([[a]]), np.array([[0.8 * a]]), unbiased=True)
+    node = {"C": [[C]], "D": [[0.0, 0.3]], "arrival_probability": 0.9, "loss": "seen"}
+    plant = {"A": [[a]], "B": [[1.0, 0.0]], "M": [[M]]}
+    return single(plant, node, np.array([[a]]), np.array([[0.8 * a / C]]), unbiased=True)
 
 
 def single(plant: dict[str, object], node: dict[str, object], K: Array, H: Array, **more: object) -> Gains:
@@ -90,6 +90,16 @@ def test_numbers_whose_squares_overflow_are_agreed_up_to(tmp_path: Path) -> None
     assert 270 < verdict.up_to < 280  # 3^273 is 1e130
     assert verdict.outcome == "agrees"
     assert f"agrees up to step {verdict.up_to}: later numbers are too large to compare" in verdict.text()
+
+
+@pytest.mark.parametrize("gains", [growing(2e12), growing(3.0, C=1e20), growing(30.0, M=1e15)], ids=["fast", "C", "M"])
+def test_growth_of_any_speed_and_in_any_units_accuses_nobody(gains: Gains, tmp_path: Path) -> None:
+    """Though no state was large in the step before a message was too large to be compared."""
+    steps = int(240 * np.log(10.0) / np.log(gains.problem.plant.A[0, 0]))
+    verdict = replayed(tmp_path, gains, steps)
+    assert verdict.outcome == "agrees", verdict.text()
+    assert verdict.up_to is not None
+    assert verdict.up_to < steps - 1
 
 
 def test_a_number_that_growth_does_not_explain_is_strange(tmp_path: Path) -> None:
