@@ -29,6 +29,7 @@ from designer.ledger.exact import Ledger
 from designer.lmi.multipliers import least_of_lmi, multipliers
 from designer.model.error_model import error_model, link_gains, model_of_gains, stacked_links
 from designer.model.units import NaturalUnits
+from designer.patience import Budget
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import part
 from designer.proof.by_balls import ByBalls
@@ -37,7 +38,6 @@ from designer.proof.by_vertices import upper_bound
 from designer.proof.certificate import verify
 from designer.proof.cube import Cube
 from designer.proof.least import at_least
-from designer.search.descent import Budget
 from designer.search.exact_design import certify, design_exact
 from designer.search.lmi_apart import design_apart
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains

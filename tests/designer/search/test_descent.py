@@ -23,10 +23,11 @@ from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.gain.floor import floor
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
+from designer.patience import Budget, TimeIsUp
 from designer.problems import find
 from designer.search import descent
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Descent, Progress, TimeIsUp, descend, to_its_end
+from designer.search.descent import Descent, Progress, descend
 from designer.search.effort import gradients_of_exact, seconds_of_exact, seconds_within
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
 

@@ -12,11 +12,11 @@ from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.model.error_model import error_model
+from designer.patience import Budget
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
 from designer.search import descent, effort, exact_design
-from designer.search.descent import Budget
 from designer.search.exact_design import design_exact
 from designer.search.starts import least_variance_gains
 from designer.search.windows import Windowed

@@ -14,11 +14,12 @@ from agent.contract.problem import Problem
 from designer.gain.noise import steady_state
 from designer.model.error_model import StackedGains, error_model, stacked_gains
 from designer.model.units import NaturalUnits
+from designer.patience import Budget
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.search import quiet
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Progress
+from designer.search.descent import Progress
 from designer.search.quiet import quieter
 from designer.search.starts import least_variance_gains
 from designer.synthesis import design

@@ -12,8 +12,9 @@ from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.gain.exact import exact_gain
 from designer.model.error_model import StackedGains, error_model, measurement_slices
+from designer.patience import Budget
 from designer.search import windows as room
-from designer.search.descent import Budget, follow
+from designer.search.descent import follow
 from designer.search.starts import least_variance_gains
 from designer.search.windows import WEIGHT, window_gains, windows
 
