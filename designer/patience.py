@@ -13,30 +13,38 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from typing import TypeVar
 
 Made = TypeVar("Made")
 _OFTEN = 5.0  # seconds between two words on what goes on
 
 
-def _on() -> None:
+Look = Callable[[int], None]  # of how many steps are done, where that is known
+
+
+def _on(steps: int) -> None:
     """Nobody asks for an end."""
 
 
-_looks: ContextVar[Callable[[], None]] = ContextVar("looks", default=_on)
+def _unknown() -> int | None:
+    return None
+
+
+_looks: ContextVar[Look] = ContextVar("looks", default=_on)
 
 
 class TimeIsUp(Exception):
     """Ends a search, as Ctrl-C does."""
 
 
-def look() -> None:
+def look(steps: int = 0) -> None:
     """At every step of what takes long: KeyboardInterrupt or TimeIsUp where it is to end here."""
-    _looks.get()()
+    _looks.get()(steps)
 
 
 @contextmanager
-def looking(at: Callable[[], None]) -> Iterator[None]:
+def looking(at: Look) -> Iterator[None]:
     """Within the block `look` calls this."""
     before = _looks.set(at)
     try:
@@ -57,7 +65,7 @@ class Budget:
         self.over = False  # no search comes any more
         self.left_out: list[str] = []
         self.tell: Callable[[str], None] = lambda words: None
-        self._goes_on, self._told = "", math.inf
+        self._goes_on, self._told, self._steps = "", math.inf, _unknown
 
     @classmethod
     def of(cls, seconds: float | Budget) -> Budget:
@@ -96,37 +104,38 @@ class Budget:
         finally:
             self._later = before
 
-    def check(self, ahead: float = 0.0) -> None:
+    def check(self, steps: int = 0, *, ahead: float = 0.0) -> None:
         """In a search: KeyboardInterrupt after a signal; TimeIsUp where it is, or will be in so many seconds."""
         if self.asked:
             raise KeyboardInterrupt
         if self.left <= ahead:
             raise TimeIsUp
 
-    def check_comparison(self) -> None:
+    def check_comparison(self, steps: int = 0) -> None:
         """In what can be left out: the same, but that what was kept is there for it too."""
         if self.asked:
             raise KeyboardInterrupt
         if self.is_over:
             raise TimeIsUp
 
-    def check_choice(self) -> None:
+    def check_choice(self, steps: int = 0) -> None:
         """In a choice after the search: half of what was kept is for the proof; a signal does not end it."""
         self.check_last()
         if self.left + self.kept / 2.0 <= 0.0:
             raise TimeIsUp
 
-    def check_last(self) -> None:
+    def check_last(self, steps: int = 0) -> None:
         """In what there has to be: KeyboardInterrupt after the second signal; every now and then a word on it."""
         if self.asked > 1:
             raise KeyboardInterrupt
         if self.spent >= self._told:
-            self.tell(self._goes_on)
             self._told = self.spent + _OFTEN
+            whole = self._steps() if steps else None
+            self.tell(self._goes_on if whole is None else f"{self._goes_on}, step {steps} of about {whole}")
 
-    def goes_on(self, words: str) -> None:
-        """What is told from now on, every few seconds, of work that there has to be."""
-        self._goes_on, self._told = words, self.spent
+    def goes_on(self, words: str, steps: Callable[[], int | None] = _unknown) -> None:
+        """What is told from now on, every few seconds, of work that there has to be, and of about how many steps."""
+        self._goes_on, self._told, self._steps = words, self.spent + _OFTEN, cache(steps)
 
     def watched(self, function: Callable[..., Made]) -> Callable[..., Made]:
         """The same in a search."""

@@ -96,7 +96,7 @@ def design(
             raise
         gains = least
     if budget.asked > 1 and gains.certificate.exact is None and problem.n * problem.nx <= _PROVED_STATES:
-        ignorant = gains_that_ignore(problem, method, "what was found has no lower gamma that is proved at once", started)
+        ignorant = gains_that_ignore(problem, method, "what was found has none lower that is proved at once", started)
         gains = min([gains, *([] if ignorant is None else [ignorant])], key=lambda each: each.gamma)
     found = {
         "floor": budget.compared("the floor", lambda: floor_below(problem, gains.certificate.gamma)),

@@ -70,7 +70,7 @@ def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, m
     every: list[Finding] = []
     Y, next_look = arithmetic.start(up=True), 0
     for steps in range(most + 1):
-        look()
+        look(steps)
         if steps == most or steps >= next_look:
             if _seems_below(arithmetic.floats(Y), P, gamma):
                 ends = found("Y < g P", modes, arithmetic.below(Y, P, gamma), f" after {steps} steps")

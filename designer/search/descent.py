@@ -87,6 +87,10 @@ def _cost(norm: float, radius: float) -> float:
     return norm / (1.0 - radius) if radius < 1.0 else math.inf
 
 
+def _rank_of(candidate: Candidate) -> tuple[float, float]:
+    return _rank(candidate.gain)
+
+
 def _rank(gain: Gain) -> tuple[float, float]:
     """The less, the better."""
     return gain.high, gain.radius
@@ -329,7 +333,7 @@ class _Search:
             found = function(x)
             self.outlook.evaluated(self.barrier.horizon)
             if self.fewest:
-                self.budget.check(self.fewest * (self.budget.spent - begun))
+                self.budget.check(ahead=self.fewest * (self.budget.spent - begun))
                 self.fewest = 0
             return found
 
@@ -358,7 +362,7 @@ class _Search:
                     least = self._less(least, v)
             near = self._near(least) if least.gain.stable else None
             chosen = None if near is None else self._candidate(near)
-        return least, least if chosen is None else chosen
+        return (least, least) if chosen is None else (min(least, chosen, key=_rank_of), chosen)
 
     def at_hand(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
         """Gains with a bound that takes no recursion, (17) and (18) alone: the first that have one."""
@@ -381,7 +385,7 @@ class _Search:
         return offered + ([] if self.stable else [self.barrier.entries.pack(*gains) for gains in starts.values()])
 
     def _less(self, least: Candidate, v: Array) -> Candidate:
-        return min(least, self._candidate(v), key=lambda candidate: _rank(candidate.gain))
+        return min(least, self._candidate(v), key=_rank_of)
 
     def _may_be_less(self, v: Array, least: Candidate) -> bool:
         """Whether no few steps show that the gain is not below this one."""

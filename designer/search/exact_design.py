@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.gain.exact import (
     Gain,
+    InvariantSet,
     Operator,
     exact_gain,
     horizon_gain,
@@ -25,7 +27,7 @@ from designer.gain.exact import (
     recursion_holds,
 )
 from designer.gain.floor import floor, floor_below
-from designer.lmi import beyond_paper
+from designer.lmi import LmiSolution, beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
 from designer.patience import Budget, TimeIsUp, looking
@@ -116,14 +118,16 @@ def design_exact(
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
         found = _quieter(problem, descent, slack, budget, progress, held)
-        if found is not None:
+        if found is None:
+            budget.left_out.append("the search for the least noise")
+        else:
             method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
             status = f"{_status_of_noise(found, unit)}; before: {status}"
             gain = found.gains.gain
     solved = time.perf_counter()
     K, H = link_gains(problem, *stacked)
     budget.over = True
-    budget.goes_on(phase := "proving gamma and the lower end of the exact gain")
+    budget.goes_on(phase := "proving gamma", partial(_steps_of_proof, problem, stacked, gain))
     if progress is not None:
         spent = time.perf_counter() - started
         progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase))
@@ -149,6 +153,14 @@ def design_exact(
         solve=solved - begun,
         certify=ended - solved,
     )
+
+
+def _steps_of_proof(problem: Problem, gains: StackedGains, gain: Gain) -> int | None:
+    """As floats find it; the proof takes several times as long."""
+    if gain.P is None:
+        return None
+    operator, g = Operator(error_model(problem, *gains)), (_ABOVE[4] * gain.high) ** 2
+    return recursion_holds(operator, g, MOST_STEPS, invariant=InvariantSet(gain.P)).steps
 
 
 def _quieter(
@@ -217,7 +229,7 @@ def _starts(problem: Problem, held: NDArray[np.bool_] | None, budget: Budget) ->
     lmi_gamma, ended = None, None
     until = max(budget.spent + _AT_ONCE, budget.seconds - budget.kept)
 
-    def check() -> None:
+    def check(steps: int) -> None:
         if budget.asked:
             raise KeyboardInterrupt
         if budget.spent >= until:
@@ -251,17 +263,25 @@ def _lmi_start(problem: Problem, starts: dict[str, StackedGains], budget: Budget
     if _LMI_SHARE * budget.left < _LMI_SECONDS:
         budget.left_out.append("the gains of an LMI, to start from and to compare with")
         return None
-    from designer.lmi import decomposed, theorem2  # cvxpy takes seconds to import
-
     name = "decomposed" if beyond_paper(problem) else "theorem2"
     try:
-        solution = decomposed.solve(problem) if beyond_paper(problem) else theorem2.solve(problem, reduced=True)
+        solution = _solved(problem, name)
         gains = recover(problem, solution)
     except Unattainable:
         return None  # one start less
     if np.isfinite(gains[0]).all() and np.isfinite(gains[1]).all():
         starts[name] = gains
     return solution.gamma
+
+
+def _solved(problem: Problem, name: str) -> LmiSolution:
+    if name == "decomposed":
+        from designer.lmi import decomposed
+
+        return decomposed.solve(problem)
+    from designer.lmi import theorem2  # cvxpy takes seconds to import
+
+    return theorem2.solve(problem, reduced=True)
 
 
 def _of_lmi(problem: Problem, begun_with: _Starts, budget: Budget) -> dict[str, Any]:
