@@ -120,7 +120,7 @@ def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], addre
             for future in futures:
                 while not future.done():
                     with suppress(TimeoutError):
-                        distributed.wait([future], timeout=_OFTEN)
+                        future.result(timeout=_OFTEN)
                     look()
                 yield future.result()
         except distributed.KilledWorker as error:

@@ -95,9 +95,9 @@ ROOMS = {
     "designer.commands": "agent.commands agent.conform agent.contract.recording agent.embed agent.guests "
     "agent.signals designer.analysis designer.beyond_gamma designer.box designer.compare designer.conformity "
     "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.patience "
-    "designer.problems designer.proof designer.ranking designer.replay designer.report designer.reproduce designer.search "
-    "designer.show designer.simulation designer.stacked designer.sweep designer.synthesis designer.watch "
-    "designer.what_if",
+    "designer.problems designer.proof designer.ranking designer.replay designer.report designer.reproduce "
+    "designer.search designer.show designer.simulation designer.stacked designer.sweep designer.synthesis "
+    "designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
     # the library, whose source stands in designer/library/

@@ -29,7 +29,6 @@ from designer.ledger.exact import Ledger
 from designer.lmi.multipliers import least_of_lmi, multipliers
 from designer.model.error_model import error_model, link_gains, model_of_gains, stacked_links
 from designer.model.units import NaturalUnits
-from designer.patience import Budget
 from designer.proof.ball_model import BallModel
 from designer.proof.balls import part
 from designer.proof.by_balls import ByBalls
@@ -249,7 +248,7 @@ def test_the_search_finds_gains_that_a_file_can_hold() -> None:
     assert natural.held is not None
     assert natural.held.any()
     start = least_variance_gains(natural.problem, natural.held)
-    found = design_exact(natural.problem, starts={"start": start}, first=3e-3, budget=Budget(2.0), held=natural.held)
+    found = design_exact(natural.problem, starts={"start": start}, first=3e-3, last=3e-3, held=natural.held)
     K, H = natural.back(found.K, found.H)
     assert max(np.abs(stacked(problem, gains)).max() for gains in (K, H)) < 10.0
     idle = exact_gain(model_of_gains(problem, *link_gains(problem, *ignoring(problem)))).high
