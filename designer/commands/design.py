@@ -82,8 +82,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=duration,
         metavar="TIME",
-        help="how long method exact may search: 90s, 10min, 2h; a share is kept for the proof of what it has then "
-        "(10min; 90s for small networks whose plant hardly decays)",
+        help="how long all may take: 90s, 10min, 2h; a share is kept for the proof of what there is then, and what "
+        "there is no time for is left out and said (10min; 90s for small networks whose plant hardly decays)",
     )
 
 
