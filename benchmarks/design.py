@@ -42,7 +42,7 @@ import json, resource, sys, time
 from agent.contract.gains import Gains
 from benchmarks.design import network
 from designer.proof.certificate import verify
-from designer.search.descent import Budget
+from designer.patience import Budget
 from designer.search.exact_design import design_exact
 from designer.synthesis import design
 problem, budget = network(sys.argv[2], seed=int(sys.argv[3])), float(sys.argv[4])

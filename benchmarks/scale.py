@@ -29,10 +29,11 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.model.error_model import StackedGains, error_model, link_gains
+from designer.patience import Budget
 from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, Make, Prover
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Progress, descend
+from designer.search.descent import Progress, descend
 from designer.search.starts import least_variance_gains
 from designer.search.windows import WEIGHT, window_gains, windows
 

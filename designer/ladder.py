@@ -98,7 +98,7 @@ class Ladder(NamedTuple):
         width = max((len(value) for value, _ in texts), default=0)
         lines = [f"{value:{width}}  {name}" for value, name in texts]
         if self.exact is None and self.gamma is not None:
-            lines.append(f"{'-':{width}}  {EXACT}: not computed for so large a network; analyse does")
+            lines.append(f"{'-':{width}}  {EXACT}: not computed; analyse does")
         return lines
 
 

@@ -6,10 +6,13 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
+import numpy as np
+
 from agent.contract.errors import InputError, Unattainable, listed
-from agent.contract.gains import Certificate, Gains
+from agent.contract.gains import Certificate, Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box
@@ -18,19 +21,22 @@ from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_est
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor_below
 from designer.gain.worst_case import with_worst_case
-from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed
+from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed, gains_that_ignore
 from designer.model.error_model import model_of_gains
 from designer.model.units import NaturalUnits
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.certificate import lyapunov_matrix
 from designer.proof.prover import Prover
 from designer.search.baselines import BASELINES, design_baseline
-from designer.search.descent import Budget, Progress, to_its_end
+from designer.search.descent import Progress
 from designer.search.effort import BUDGET, default_method
-from designer.search.exact_design import certify, confirmed, design_exact, lower_end
+from designer.search.exact_design import certify, certify_at_once, confirmed, design_exact, lower_end
 from designer.search.lmi_apart import design_apart
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
 _PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
+_SMALLEST = 1e-40  # and its inverse: products of some such numbers are far from the ends of float64
+SHARE_OF_BOX = 0.5  # of a search's time
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
@@ -43,7 +49,7 @@ def design(
     problem: Problem,
     *,
     method: str | None = None,
-    budget: float = BUDGET,
+    budget: float | Budget = BUDGET,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
     peak_slack: float = 0.0,
@@ -51,12 +57,15 @@ def design(
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
     The default method is "exact"; for more than 200 nodes of whom some hear very many others it is "decomposed".
-    `progress` and `budget` are for the method "exact", which returns its best gains when its seconds are over, the
-    proof after that, and on KeyboardInterrupt. `dask`: the address of a cluster for the windows of large networks.
+    `budget`: seconds for all of it. When they are over, or a signal came that the budget was told of, the best gains
+    so far are proved and returned, for a stable plant those that ignore all measurements at least; else there is
+    KeyboardInterrupt. What was left out is said in the budget. `progress` is for the method "exact".
+    `dask`: the address of a cluster for the windows of large networks.
     `peak_slack`, for that method too: gamma may be that part larger than the least one, for gains with less noise.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.
     """
+    budget, started = Budget.of(budget), time.perf_counter()
     method = default_method(problem) if method is None else method
     if method not in methods():
         raise InputError(f'method "{method}" does not exist; the methods are {listed(methods())}')
@@ -66,18 +75,44 @@ def design(
         raise InputError(f"--peak-slack {peak_slack:g}: a part of gamma, 0 or more; 0.05 and 5% are the same")
     refuse_nothing_to_estimate(problem)
     refuse_hopeless(problem)
-    if method in BASELINES:
-        return with_worst_case(design_baseline(problem, method))
     try:
-        if method == EXACT:
-            gains = _exact_in_natural_units(problem, budget, progress, dask, peak_slack)
-        else:
-            gains = _with_exact(design_apart(problem, method) or design_by_lmi(problem, method))
+        with looking(budget.check_last):
+            if method in BASELINES:
+                return with_worst_case(design_baseline(problem, method, budget))
+            if method == EXACT:
+                gains = _exact_in_natural_units(problem, budget, progress, dask, peak_slack)
+            else:
+                apart = design_apart(problem, method, budget)
+                gains = _with_exact(apart or design_by_lmi(problem, method, budget), budget)
     except Unattainable as error:
-        raise explained(problem, error, _solvable) from None
-    least = floor_below(problem, gains.certificate.gamma)
-    certificate = gains.certificate.model_copy(update={"floor": least, "lmi_least": _least_of_lmi(gains)})
+        least = gains_that_ignore(problem, method, str(error), started) if method == EXACT else None
+        if least is None:
+            reason = partial(explained, problem, error, _solvable)
+            raise budget.compared("what would have to change", reason) or error from None
+        gains = least
+    except (KeyboardInterrupt, TimeIsUp) as stopped:
+        least = None if _from_elsewhere(stopped, budget) else gains_that_ignore(problem, method, _why(stopped), started)
+        if least is None:
+            raise
+        gains = least
+    if budget.asked > 1 and gains.certificate.exact is None and problem.n * problem.nx <= _PROVED_STATES:
+        ignorant = gains_that_ignore(problem, method, "what was found has none lower that is proved at once", started)
+        gains = min([gains, *([] if ignorant is None else [ignorant])], key=lambda each: each.gamma)
+    found = {
+        "floor": budget.compared("the floor", lambda: floor_below(problem, gains.certificate.gamma)),
+        "lmi_least": _least_of_lmi(gains, budget),
+    }
+    certificate = gains.certificate.model_copy(update=found)
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
+
+
+def _from_elsewhere(stopped: BaseException, budget: Budget) -> bool:
+    """Whether this came from somebody who does not tell the budget, and wants all to end."""
+    return isinstance(stopped, KeyboardInterrupt) and not budget.asked
+
+
+def _why(stopped: BaseException) -> str:
+    return "it was interrupted" if isinstance(stopped, KeyboardInterrupt) else "time was up"
 
 
 def design_in_box(
@@ -85,32 +120,59 @@ def design_in_box(
     box: Box,
     *,
     method: str | None = None,
-    budget: float = BUDGET,
+    budget: float | Budget = BUDGET,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
     peak_slack: float = 0.0,
 ) -> ForBox:
     """Gains with a gamma that is proved for every model of the box, no larger than that of the nominal design.
 
-    As `design`, which begins and takes of the budget what it needs. Other methods do not design for a box, nor does
+    As `design`, which begins and takes up to half of the budget. Other methods do not design for a box, nor does
     `peak_slack`: of their gains it is proved what holds.
     """
-    seconds = Budget(budget)
-    nominal = design(problem, method=method, budget=budget, progress=progress, dask=dask, peak_slack=peak_slack)
-    stopped = nominal.solver.status.startswith("interrupted")
-    return design_for_box(problem, box, nominal, search=not stopped, budget=seconds, progress=progress)
+    budget = Budget.of(budget)
+    with budget.leaving(SHARE_OF_BOX):
+        nominal = design(problem, method=method, budget=budget, progress=progress, dask=dask, peak_slack=peak_slack)
+    found = from_nominal(problem, box, nominal, budget, progress=progress)
+    if found is None:
+        raise KeyboardInterrupt
+    return found
 
 
-def _least_of_lmi(gains: Gains) -> float | None:
+def from_nominal(
+    problem: Problem,
+    box: Box,
+    nominal: Gains,
+    budget: Budget,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> ForBox | None:
+    """The same from gains that were designed without the box; None where a second signal came before it was proved."""
+    search = not (budget.asked or nominal.solver.status.startswith("interrupted"))
+    budget.over = not search
+    budget.goes_on("proving gamma for every model of the box")
+    return budget.to_its_end(
+        lambda: design_for_box(problem, box, nominal, search=search, budget=budget, progress=progress),
+        lambda: None,
+    )
+
+
+def _least_of_lmi(gains: Gains, budget: Budget) -> float | None:
     """Where an LMI is what the gains come from or what they are compared with."""
-    from designer.lmi.multipliers import least_of_lmi  # scipy takes long to import
+    if gains.certificate.lmi_gamma is None:
+        return None
 
-    return None if gains.certificate.lmi_gamma is None else least_of_lmi(gains.problem)
+    def least() -> float | None:
+        from designer.lmi.multipliers import least_of_lmi  # scipy takes long to import
+
+        return least_of_lmi(gains.problem)
+
+    return budget.compared("the least that the LMI can give", least)
 
 
 def _exact_in_natural_units(
     problem: Problem,
-    budget: float,
+    budget: Budget,
     progress: Callable[[Progress], None] | None,
     dask: str | None,
     slack: float,
@@ -120,11 +182,11 @@ def _exact_in_natural_units(
     Where M cancels, z itself is a state in the search; if that leads nowhere, as where what z is made of grows and
     sensors hardly tell it apart, the states are those of the problem after all.
     """
-    coordinates, limit = Coordinates.of(problem), Budget(budget)
+    coordinates = Coordinates.of(problem)
     if coordinates is not None:
         with suppress(Unattainable):
-            return _searched(problem, NaturalUnits(problem, coordinates), limit, progress, dask, slack)
-    return _searched(problem, NaturalUnits(problem), limit, progress, dask, slack)
+            return _searched(problem, NaturalUnits(problem, coordinates), budget, progress, dask, slack)
+    return _searched(problem, NaturalUnits(problem), budget, progress, dask, slack)
 
 
 def _searched(
@@ -151,14 +213,30 @@ def _searched(
     )
     K, H = natural.back(gains.K, gains.H)
     certificate = _in_units_of(gains.certificate, unit)
-    small = problem.n * problem.nx <= _PROVED_STATES
     if natural.coordinates is not None:
         compared = {"lmi_gamma": certificate.lmi_gamma, "lmi_exact": certificate.lmi_exact}
-        certificate = to_its_end(lambda: certify(problem, K, H)).model_copy(update=compared)
-    elif small and not Prover(problem, K, H).exact(certificate.gamma).holds:  # numbers near the ends of float64
-        certificate = certify(problem, K, H)
+        certificate = _certified(problem, K, H, budget).model_copy(update=compared)
+    elif not _proved_again(problem, K, H, certificate.gamma, budget):  # numbers near the ends of float64
+        certificate = _certified(problem, K, H, budget)
     update = {"problem": problem, "problem_digest": problem.digest(), "K": K, "H": H, "certificate": certificate}
     return gains.model_copy(update=update)
+
+
+def _certified(problem: Problem, K: LinkMatrices, H: LinkMatrices, budget: Budget) -> Certificate:
+    return budget.to_its_end(lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H))
+
+
+def _proved_again(problem: Problem, K: LinkMatrices, H: LinkMatrices, gamma: float, budget: Budget) -> bool:
+    """Of small networks; of others, and where time is up, powers of two leave a proof of numbers in range as it is."""
+    if problem.n * problem.nx <= _PROVED_STATES and not budget.is_over:
+        with suppress(KeyboardInterrupt, TimeIsUp), looking(budget.check_comparison):
+            return Prover(problem, K, H).exact(gamma).holds
+    plant, nodes = problem.plant, problem.nodes
+    heard = [row for links in (K, H) for of_mode in links.values() for row in of_mode.values()]
+    gains = [matrix for row in heard for matrix in row.values()]
+    every = [plant.A, plant.B, plant.M, *(node.C for node in nodes), *(node.D for node in nodes), *gains]
+    sizes = np.abs(np.concatenate([matrix.reshape(-1) for matrix in every]))
+    return bool(((sizes == 0.0) | ((sizes > _SMALLEST) & (sizes < 1.0 / _SMALLEST))).all())
 
 
 def _in_units_of(certificate: Certificate, unit: float) -> Certificate:
@@ -170,7 +248,7 @@ def _in_units_of(certificate: Certificate, unit: float) -> Certificate:
     return certificate.model_copy(update=said)
 
 
-def _with_exact(gains: Gains) -> Gains:
+def _with_exact(gains: Gains, budget: Budget) -> Gains:
     """The gains of an LMI with their exact gain; where it is below Theorem 1's gamma it is proved beside that.
 
     The P that an LMI gave satisfies (17), so it ends the recursion too. Not for networks where that takes too long.
@@ -180,6 +258,12 @@ def _with_exact(gains: Gains) -> Gains:
         return gains
     if problem.n * problem.nx > _LADDER_STATES:
         return gains
+    return budget.compared("the exact gain of these gains", lambda: _with_gain(gains)) or gains
+
+
+def _with_gain(gains: Gains) -> Gains:
+    """With it, and what is proved of it."""
+    problem, certificate = gains.problem, gains.certificate
     started = time.perf_counter()
     gain = exact_gain(model_of_gains(problem, gains.K, gains.H))
     exact = gain.bounds
@@ -206,7 +290,7 @@ def _solvable(problem: Problem) -> bool:
     from designer.lmi import decomposed
 
     try:
-        first_confirmed(problem, "decomposed", decomposed.answers(problem, last_resort=False))
+        first_confirmed(problem, "decomposed", decomposed.answers(problem, last_resort=False), Budget())
     except Unattainable:
         return False
     return True

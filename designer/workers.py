@@ -12,13 +12,16 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from typing import TypeVar
 
 from agent.contract.errors import InputError, RunBroken
 from agent.contract.extras import needing
+from designer.patience import look
 
+_OFTEN = 0.5  # seconds between two looks whether it is to end
 PATIENCE = 30  # seconds for a Dask scheduler to answer, and for the first of its workers to be there
 
 Item = TypeVar("Item")
@@ -68,6 +71,9 @@ def _on_processes(function: Callable[[Item], Result], items: Sequence[Item], num
     try:
         futures = deque(pool.submit(function, item) for item in items)
         while futures:
+            while not futures[0].done():
+                wait([futures[0]], timeout=_OFTEN)
+                look()
             yield futures.popleft().result()
     except BrokenProcessPool:
         raise RunBroken(
@@ -112,6 +118,10 @@ def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], addre
         futures = client.map(function, items, pure=False)
         try:
             for future in futures:
+                while not future.done():
+                    with suppress(TimeoutError):
+                        future.result(timeout=_OFTEN)
+                    look()
                 yield future.result()
         except distributed.KilledWorker as error:
             raise RunBroken(f"workers of the Dask cluster at {address} died: {error}") from None

@@ -48,16 +48,17 @@ ROOMS = {
     "agent.__main__": "agent.cli",
     "agent.nursery": "agent.children agent.cli agent.network agent.roles",
     # the mathematics
+    "designer.patience": "",
     "designer.coordinates": "",
     "designer.decay": "",
     "designer.invariants": "designer.decay",
     "designer.model": "designer.coordinates",
-    "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model",
-    "designer.proof": "designer.coordinates designer.decay designer.invariants",
-    "designer.lmi": "designer.coordinates designer.gain designer.model designer.proof",
-    "designer.workers": "",
+    "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model designer.patience",
+    "designer.proof": "designer.coordinates designer.decay designer.invariants designer.patience",
+    "designer.lmi": "designer.coordinates designer.gain designer.model designer.patience designer.proof",
+    "designer.workers": "designer.patience",
     "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
-    "designer.proof designer.workers",
+    "designer.patience designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
@@ -66,9 +67,9 @@ ROOMS = {
     "designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
     "designer.box": "designer.coordinates designer.decay designer.gain designer.invariants designer.ladder "
-    "designer.model designer.proof designer.search",
+    "designer.model designer.patience designer.proof designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
-    "designer.model designer.proof designer.search",
+    "designer.model designer.patience designer.proof designer.search",
     "designer.stacked": "designer.model",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
     "designer.lmi designer.model designer.proof designer.search designer.stacked",
@@ -94,10 +95,10 @@ ROOMS = {
     "designer.show": "agent.contract.recording designer.problems",
     "designer.commands": "agent.commands agent.conform agent.contract.recording agent.embed agent.guests "
     "agent.signals designer.analysis designer.beyond_gamma designer.box designer.compare designer.conformity "
-    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.problems "
-    "designer.proof designer.ranking designer.replay designer.report designer.reproduce designer.search "
-    "designer.show designer.simulation designer.stacked designer.sweep designer.synthesis designer.watch "
-    "designer.what_if",
+    "designer.diagnosis designer.export designer.gain designer.identify designer.ladder designer.patience "
+    "designer.problems designer.proof designer.ranking designer.replay designer.report designer.reproduce "
+    "designer.search designer.show designer.simulation designer.stacked designer.sweep designer.synthesis "
+    "designer.watch designer.what_if",
     "designer.cli": "agent.cli agent.commands designer.commands",
     "designer.__main__": "designer.cli",
     # the library, whose source stands in designer/library/
@@ -173,7 +174,7 @@ LAZY = [
 LIGHT = [
     "agent.cli", "agent.commands", "agent.plan", "agent.signals", "agent.contract.errors", "agent.contract.extras",
     "agent.contract.files",
-    "designer.cli", "designer.commands",
+    "designer.cli", "designer.commands", "designer.patience",
 ]  # fmt: skip
 
 

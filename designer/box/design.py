@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agent.contract.errors import Unattainable, counted
-from agent.contract.gains import Certificate, Gains, LinkMatrices
+from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box
 from designer.box.robust import Robust, robust
@@ -29,17 +29,19 @@ from designer.gain.worst_case import with_worst_case
 from designer.ladder import Ladder, percent
 from designer.model.error_model import link_gains, stacked_links
 from designer.model.units import NaturalUnits
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.deviations import Entry
 from designer.search import bfgs
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Progress, TimeIsUp, longest_horizon
-from designer.search.exact_design import certify
+from designer.search.descent import Progress, longest_horizon
+from designer.search.exact_design import certify, certify_at_once
 
 _WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5)  # mu
 _ROUNDS = 3  # for each mu: models that join
 _MOST_MODELS = 12
 _HORIZON = 20
 _SHORT = 1e-3  # a model that was met may exceed sqrt(g) by so much, before the horizon is doubled
+_PROOFS_KEPT = 1.2  # as long as the first one: so much of the budget is for the last
 _BETTER = 1e-4  # gamma has to be lower by so much of itself, or the search ends
 
 
@@ -100,23 +102,29 @@ def design_for_box(
     KeyboardInterrupt ends the search, and so does the end of the budget; what was best is returned. Gains of another
     method than "exact" are taken as they are, and so are all where not to `search`.
     """
-    started = time.perf_counter()
+    started, budget = time.perf_counter(), Budget() if budget is None else budget
     try:
         before = robust(problem, nominal.K, nominal.H, box)
     except KeyboardInterrupt:  # without it nothing is known of the box
+        if budget.asked > 1:
+            raise
         before, search = robust(problem, nominal.K, nominal.H, box), False
+    budget.keep(_PROOFS_KEPT * (time.perf_counter() - started))
     if nominal.method != "exact":
         return ForBox(nominal, before, nominal, before, f"method {nominal.method} does not design for a box")
     if not search:
         return ForBox(nominal, before, nominal, before, "interrupted, nothing else was tried")
-    descent = _Search(problem, box, nominal, before, Budget() if budget is None else budget, progress)
+    descent = _Search(problem, box, nominal, before, budget, progress)
     ended = descent.run()
     searched = f"{ended} after {counted(descent.steps, 'change')} at {counted(len(descent.met), 'corner')} of the box"
     if descent.best is None:
         return ForBox(nominal, before, nominal, before, f"nothing better was found; {searched}")
     K, H, after = descent.best
+    budget.over = True
     try:
-        certificate = _certified(problem, K, H)
+        certificate = budget.to_its_end(
+            lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H)
+        )
     except Unattainable:
         return ForBox(nominal, before, nominal, before, f"what was found has no certificate; {searched}")
     known = {name: getattr(nominal.certificate, name) for name in ("floor", "lmi_gamma", "lmi_exact", "lmi_least")}
@@ -130,13 +138,6 @@ def design_for_box(
         "seconds": nominal.seconds | {"box": spent, "total": nominal.seconds["total"] + spent},
     }
     return ForBox(with_worst_case(nominal.model_copy(update=update)), after, nominal, before, searched)
-
-
-def _certified(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
-    try:
-        return certify(problem, K, H)
-    except KeyboardInterrupt:  # the search is over
-        return certify(problem, K, H)
 
 
 class _Search:
@@ -166,7 +167,8 @@ class _Search:
     def run(self) -> str:
         """How it ended."""
         try:
-            self.descend()
+            with looking(self.budget.check):
+                self.descend()
         except KeyboardInterrupt:
             return self._stopped("interrupted")
         except TimeIsUp:

@@ -12,6 +12,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.decay import is_positive
+from designer.patience import look
 from designer.proof.cube import joined
 
 
@@ -33,6 +34,7 @@ class Steps(NamedTuple):
 
 def step(S: Array, n: int, g: float) -> Step | None:
     """From S (modes, n + nw, n + nw) of what weighs eta; None where a W is not positive definite."""
+    look()
     W, cross = g * np.eye(S.shape[1] - n) - S[:, n:, n:], S[:, n:, :n]
     if not (np.isfinite(S).all() and is_positive(W)):
         return None

@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from agent.contract.files import refuse_overwrite
 from designer.commands import PROBLEM, add_set, add_table, find_to_design, refuse_both, tell_notes
 from designer.commands.stopping import stoppable
 from designer.commands.within import add_within, asked
+from designer.patience import Budget
 
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
@@ -80,8 +82,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=duration,
         metavar="TIME",
-        help="how long method exact may search: 90s, 10min, 2h; a share is kept for the proof of what it has then "
-        "(10min; 90s for small networks whose plant hardly decays)",
+        help="how long all may take: 90s, 10min, 2h; a share is kept for the proof of what there is then, and what "
+        "there is no time for is left out and said (10min; 90s for small networks whose plant hardly decays)",
     )
 
 
@@ -150,6 +152,7 @@ def design_and_save(
     within: Sequence[str] = (),
 ) -> tuple[Gains, dict[str, Any]]:
     """Design gains and save them; returns them and the facts to print. A method of None chooses by the size."""
+    limit = Budget()
     path = output or Path(f"{problem.name}.gains.json")
     refuse_overwrite(path, force=force)
     from designer.beyond_gamma import beyond_gamma
@@ -158,37 +161,36 @@ def design_and_save(
     from designer.ladder import ladder_of
     from designer.proof.certificate import stored_P
     from designer.search.effort import default_budget
-    from designer.synthesis import design, design_in_box  # only now: it loads a solver
+    from designer.synthesis import SHARE_OF_BOX, design, from_nominal  # only now: it loads a solver
 
     box = asked(problem, within)
     warned = warnings(problem)
     for warning in warned:
         print(f"warning: {warning}", file=sys.stderr)
     noted = tell_notes(problem)
-    method, budget = method or _chosen_method(problem, budget), default_budget(problem) if budget is None else budget
+    method = method or _chosen_method(problem, budget)
+    limit.seconds = default_budget(problem) if budget is None else budget
     if dask is not None:
         _refuse_nothing_to_spread(problem, method)
-    with stoppable() as search:
-        tell = _descent_progress(budget, alone=box is None and not peak_slack)
-
-        def progress(at: Progress) -> None:
-            search.over |= at.over and box is None  # else the search on the worst models follows
-            tell(at)
-            if at.mu > 0.0:  # neither choice nor proof
-                search.stepped()
-
-        how: dict[str, Any] = {"method": method, "budget": budget, "dask": dask, "peak_slack": peak_slack}
-        how["progress"] = progress
-        found = None if box is None else design_in_box(problem, box, **how)
-        gains = design(problem, **how) if found is None else found.gains
-    if found is not None and not within:  # the box is in the file, and so is what is proved of it
-        gains = with_claim(gains, found.robust)
+    progress = _descent_progress(limit.seconds, alone=box is None and not peak_slack)
+    limit.tell = lambda words: _tell(words, limit.spent)
+    how: dict[str, Any] = {"method": method, "progress": progress, "dask": dask, "peak_slack": peak_slack}
+    with stoppable(limit):
+        with limit.leaving(0.0 if box is None else SHARE_OF_BOX):
+            gains = design(problem, budget=limit, **how)
+        found = None if box is None else from_nominal(problem, box, gains, limit, progress=progress)
+        if found is not None:
+            gains = found.gains if within else with_claim(found.gains, found.robust)  # the file has its own box
+        gains.save(path, force=force)
+        reckon = partial(beyond_gamma, problem, gains.K, gains.H, stored_P(gains))
+        beyond = limit.compared("noise, and the gains of single nodes", reckon)
+    if box is not None and found is None:
+        limit.left_out.append("what holds for every model of the box")
     if gains.solver.status.startswith("out of time"):
         print(
             f"warning: the search was out of time after {gains.solver.iterations} steps; --budget gives it more",
             file=sys.stderr,
         )
-    gains.save(path, force=force)
     proved, ladder = gains.certificate, ladder_of(gains)
     return gains, {
         "problem": problem.name,
@@ -200,10 +202,11 @@ def design_and_save(
         "floor": proved.floor,
         "ladder": (ladder if found is None else found.on(ladder)).document(),
         "within": None if found is None else found.document(),
-        **beyond_gamma(problem, gains.K, gains.H, stored_P(gains)).document(),
+        **({"white_noise": None, "start": None, "node_gains": None} if beyond is None else beyond.document()),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
+        "left_out": limit.left_out,
         "warnings": warned,
         "notes": noted,
         "output": str(path),
@@ -270,12 +273,13 @@ def design_text(result: dict[str, Any]) -> str:
     solver = result["solver"]
     ladder = "\n           ".join(ladder_in(result).lines())
     box = "".join(f"{line}\n" for line in (result["within"] or {"said": []})["said"])
-    beyond = "\n".join(told(result))
+    left_out = "".join(f"left out   {what}\n" for what in result["left_out"])
+    beyond = "" if result["white_noise"] is None and left_out else "\n".join([*told(result), ""])
     return (
         f"{result['problem']} by {result['method']}: gamma = {rounded_up(result['gamma'])}, certified\n"
         f"ladder     {ladder}\n"
         f"{box}"
-        f"{beyond}\n"
+        f"{beyond}{left_out}"
         f"solver     {solver['name']} {solver['version']}: {solver['iterations']} iterations, "
         f"{result['seconds']['total']:.1f} s in all\n"
         f"status     {solver['status']}\n"
@@ -316,6 +320,12 @@ def _descent_progress(budget: float, *, alone: bool = True) -> Callable[[Progres
             print(f"{done}{rounds}, {so_far}; Ctrl-C keeps the best so far", file=sys.stderr)
 
     return show
+
+
+def _tell(words: str, spent: float) -> None:
+    """To whoever has waited long."""
+    if spent >= _LONG_ENOUGH:
+        print(f"{spent:5.0f} s  {words}", file=sys.stderr)
 
 
 def _price_command(problem: Problem, options: argparse.Namespace) -> int:

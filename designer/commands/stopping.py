@@ -1,4 +1,8 @@
-"""Ctrl-C and SIGTERM while gains are designed: the first ends the search, and what was found by then becomes a file."""
+"""Ctrl-C and SIGTERM while gains are designed: the first ends the search, and what was found by then becomes a file.
+
+A second one cuts short what comes after the search; then the file has a gamma that is proved at once. A signal itself
+raises nothing: whoever works looks at the budget, and ends there.
+"""
 
 from __future__ import annotations
 
@@ -7,37 +11,37 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from agent.contract.errors import Interrupted
 from agent.signals import heed, restore
+from designer.patience import Budget
 
-STOPPING = "stopping: the best gains so far are chosen and certified, which takes seconds, of large networks minutes"
+STOPPING = (
+    "stopping: the best gains so far are chosen and certified, which takes seconds, of large networks minutes; "
+    "once more, and their gamma is one that is proved at once"
+)
 STOPPED = "still at it: the search is over, and the gains are written as soon as they are certified"
-
-
-class Search:
-    """What signals may end."""
-
-    over = False  # all that is left is to be written
-    asked = False  # a signal has come
-
-    def stepped(self) -> None:
-        """A search goes on: KeyboardInterrupt where a signal came whose own was lost, in a callback of a library."""
-        if self.asked:
-            raise KeyboardInterrupt
+HURRYING = "hurrying: what can be proved at once is written, and nothing that takes longer"
+NOTHING = "nothing was found by then that could be proved, so nothing is written"
 
 
 @contextmanager
-def stoppable() -> Iterator[Search]:
-    """The first signal raises KeyboardInterrupt, unless the search is over; those after it are answered alone."""
-    search = Search()
+def stoppable(budget: Budget) -> Iterator[None]:
+    """Signals are told to the budget, and answered; where nothing comes of it all, Interrupted."""
+    first: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        print(STOPPED if search.over else STOPPING, file=sys.stderr, flush=True)
-        if not search.over:
-            search.over = search.asked = True
-            raise KeyboardInterrupt
+        budget.asked += 1
+        first.append(number)
+        said = HURRYING if budget.asked > 1 else STOPPED if budget.over else STOPPING
+        print(said, file=sys.stderr, flush=True)
 
     handlers = heed(stop)
     try:
-        yield search
+        yield
+    except KeyboardInterrupt:
+        if first:
+            print(NOTHING, file=sys.stderr)
+            raise Interrupted(first[0]) from None
+        raise
     finally:
         restore(handlers)

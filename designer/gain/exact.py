@@ -9,7 +9,7 @@ In comments and docstrings B'Y_bar B and B'Y_bar A are the blocks of `Operator.j
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from designer.invariants import Threshold, invariants, scaled
 from designer.model.error_model import ErrorModel
 from designer.model.links import LinkTerms
 from designer.model.units import natural_scale
+from designer.patience import look
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _WIDTH_OF_LARGE = 1e-4  # where a sweep takes 10 s and more, and one that holds near gamma several times as many steps
@@ -80,6 +81,7 @@ class Operator:
 
         Y_bar is symmetric; the result is (modes, n_eta + nw, n_eta + nw).
         """
+        look()
         S = self.products.joint(Y_bar)
         if self.links is not None:
             self.links.add(S, Y_bar)
@@ -99,6 +101,7 @@ class Operator:
         The adjoint of L: `joint` has E[[eta; w][eta; w]'; r(k) = s] for every s, (modes, n_eta + nw, n_eta + nw).
         `collected` gets the derivatives of what Y_bar weighs, but for those by the links.
         """
+        look()
         X = self.products.carry(joint, collected, Y_bar)
         if self.links is not None:
             self.links.carry(X, joint)
@@ -208,12 +211,11 @@ def recursion_holds(
     horizon: int,
     *,
     invariant: InvariantSet | None = None,
-    look: Callable[[], None] = lambda: None,
 ) -> Trial:
     """Whether gamma_T^2 <= g, T = horizon: whether every W is positive definite.
 
     With an invariant set the question is whether gamma^2 <= g; it is looked for every now and then, so that looking
-    takes a sixteenth more steps, not as long as they; `look` is called as often.
+    takes a sixteenth more steps, not as long as they.
     """
     Y, measure, next_look = operator.MM, 0.0, 1
     for steps in range(1, horizon + 1):
@@ -222,13 +224,20 @@ def recursion_holds(
             return Trial(False, -math.inf, steps)
         Y, measure = taken.Y, measure + float(taken.log_det.min())
         if invariant is not None and steps >= next_look:
-            look()
             if invariant.contains(Y, g):
                 return Trial(True, measure, steps)
             if invariant.never_reached(Y, g):
                 return Trial(False, -math.inf, steps)
             next_look = steps + 1 + steps // 16
     return Trial(True if invariant is None else None, measure, horizon)
+
+
+def invariant_set(operator: Operator, decays: Decay | None = None) -> InvariantSet:
+    """In which recursions end; without P where floats find none. `decays`: of this operator, where it is known."""
+    if decays is None:
+        decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
+    P, thresholds = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
+    return InvariantSet(*P, thresholds=thresholds)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
@@ -240,15 +249,14 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
-    P, thresholds = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
-    if not P:
+    invariant = invariant_set(operator, decays)
+    if not invariant.P:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
         return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
-    invariant = InvariantSet(*P, thresholds=thresholds)
     if width is None:
         width = _WIDTH if model.size < _LARGE else _WIDTH_OF_LARGE
     found = _bracket(operator, _MOST_STEPS, invariant, width)
-    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, P[0], decays.radius)
+    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, invariant.P[0], decays.radius)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -259,10 +267,9 @@ def node_gains(model: ErrorModel) -> list[tuple[float, float]] | None:
     """
     operator = Operator(model)
     decays = decay(operator.corner, model.modes, operator.units, operator.model.moves)
-    P, thresholds = invariants(operator.of, decays, operator.units, operator.MM)
-    if not P:
+    invariant = invariant_set(operator, decays)
+    if not invariant.P:
         return None
-    invariant = InvariantSet(*P, thresholds=thresholds)
     found = []
     for M in np.split(model.M, len(model.rows)):
         operator.MM = np.broadcast_to(M.T @ M, operator.MM.shape)

@@ -21,6 +21,7 @@ from agent.contract.arrays import Array
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.model.units import NaturalUnits
+from designer.patience import look
 
 _SETTLED = 1e-12
 _ROUNDED = 1e-6
@@ -44,6 +45,7 @@ def floor(problem: Problem) -> float:
     D = np.vstack([node.D for node in problem.nodes])
     S, reached = np.zeros((problem.nx, problem.nx)), [0.0]
     for _ in range(_MOST_STEPS):
+        look()
         kernel = _kernel(np.hstack([C @ S, D]))
         step = np.hstack([plant.A @ S, plant.B])
         left, sizes, _ = np.linalg.svd(step @ kernel, full_matrices=False)

@@ -14,6 +14,7 @@ import scipy.sparse
 from agent.contract.arrays import Array
 from agent.contract.gains import Solver
 from designer.lmi.cones import Cones
+from designer.patience import look
 
 _WORDS = {  # cvxpy's words, so that a gains file says the same whichever way the solver was called
     "Solved": "optimal",
@@ -52,12 +53,15 @@ def clarabel(cones: Cones, q: Array) -> Answer:
         settings.direct_solve_method = "qdldl"
     parts = [package.PSDTriangleConeT(order) for order in cones.orders]
     none = scipy.sparse.csc_matrix((len(q), len(q)))
-    started = time.perf_counter()
+    started, heard = time.perf_counter(), Heard()
     try:
-        found = package.DefaultSolver(none, q, cones.A, cones.b, parts, settings).solve()
+        solver = package.DefaultSolver(none, q, cones.A, cones.b, parts, settings)
+        solver.set_termination_callback(heard)
+        found = solver.solve()
     except BaseException as error:
         seconds = time.perf_counter() - started
         return Answer(np.zeros(len(q)), _record("CLARABEL", failure(error), 0, (np.inf, np.inf), seconds))
+    heard.raise_again()
     seconds = time.perf_counter() - started
     status = _WORDS.get(str(found.status), f"failed: {found.status}")
     return Answer(
@@ -65,6 +69,26 @@ def clarabel(cones: Cones, q: Array) -> Answer:
         _record("CLARABEL", status, int(found.iterations), (float(found.r_prim), float(found.r_dual)), seconds),
         np.array(found.z),
     )
+
+
+class Heard:
+    """Looks whether it is to end at every iteration of a solver, through which nothing can be raised."""
+
+    def __init__(self) -> None:
+        self._why: BaseException | None = None
+
+    def __call__(self, info: Any) -> bool:
+        """Whether to end."""
+        try:
+            look()
+        except BaseException as why:
+            self._why = why
+        return self._why is not None
+
+    def raise_again(self) -> None:
+        """After the solver has ended."""
+        if self._why is not None:
+            raise self._why
 
 
 def scs(cones: Cones, q: Array) -> Answer:

@@ -19,6 +19,7 @@ from designer.lmi.inwards import inwards
 from designer.lmi.recovery import block_diagonal, links, unconfirmed
 from designer.model.error_model import error_model, link_gains, stacked_links
 from designer.model.units import natural_units
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.prover import Prover
 
 
@@ -34,28 +35,45 @@ class Designed(NamedTuple):
         return self.confirmed.verdict.gamma
 
 
-def design_by_lmi(problem: Problem, method: str) -> Gains:
-    started = time.perf_counter()
+def design_by_lmi(problem: Problem, method: str, budget: Budget | None = None) -> Gains:
+    """KeyboardInterrupt and TimeIsUp where a signal or the end of the budget came before an answer was confirmed."""
+    started, budget = time.perf_counter(), Budget() if budget is None else budget
     try:
-        solution, (K, H, confirmed), certify = first_confirmed(problem, method, METHODS[method](problem))
-        solver, lmi_gamma = solution.solver, solution.gamma
+        found = first_confirmed(problem, method, METHODS[method](problem), budget)
     except Unattainable as error:
-        designed = ignoring(problem) if method in MOVABLE else None
-        if designed is None:
+        ignorant = gains_that_ignore(problem, method, str(error), started) if method in MOVABLE else None
+        if ignorant is None:
             raise
-        (K, H, confirmed), certify, lmi_gamma = designed, 0.0, None
-        why = f"gains that ignore all measurements, because {error}"
-        solver = Solver(name="none", version="-", status=why, iterations=0, seconds=time.perf_counter() - started)
+        return ignorant
+    solution, (K, H, confirmed), certify = found
     ended = time.perf_counter()
     return Gains.of(
         problem,
         K,
         H,
         method=method,
-        certificate=_certificate(problem, confirmed, lmi_gamma=lmi_gamma),
-        solver=solver,
+        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
+        solver=solution.solver,
         solve=ended - started - certify,
         certify=certify,
+    )
+
+
+def gains_that_ignore(problem: Problem, method: str, why: str, started: float) -> Gains | None:
+    """What is left of a design that began then and came to nothing; None: of an unstable plant nothing is."""
+    begun, designed = time.perf_counter(), ignoring(problem)
+    if designed is None:
+        return None
+    status, ended = f"gains that ignore all measurements, because {why}", time.perf_counter()
+    return Gains.of(
+        problem,
+        designed.K,
+        designed.H,
+        method=method,
+        certificate=_certificate(problem, designed.confirmed, lmi_gamma=None),
+        solver=Solver(name="none", version="-", status=status, iterations=0, seconds=begun - started),
+        solve=begun - started,
+        certify=ended - begun,
     )
 
 
@@ -96,17 +114,31 @@ def no_measurements(problem: Problem) -> Array:
 
 
 def first_confirmed(
-    problem: Problem, method: str, answers: Iterator[LmiSolution]
+    problem: Problem, method: str, answers: Iterator[LmiSolution], budget: Budget
 ) -> tuple[LmiSolution, Designed, float]:
     """The first answer whose gamma the check confirms at most _NEAR above the LMI's; else the best that it confirms.
 
-    With the seconds that the checks took. Unattainable: no answer, or none that is confirmed.
+    With the seconds that the checks took. Unattainable: no answer, or none that is confirmed. KeyboardInterrupt,
+    TimeIsUp: none yet.
     """
     seconds, best, refused = 0.0, None, None
-    for solution in answers:
-        begun = time.perf_counter()
+    while True:
         try:
-            designed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(problem, solution)
+            with looking(budget.check):
+                budget.check()
+                following = next(answers, None)
+        except (KeyboardInterrupt, TimeIsUp):
+            if best is None:
+                raise
+            break
+        if following is None:
+            break
+        solution, begun = following, time.perf_counter()
+        try:
+            with looking(budget.check_last):
+                designed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(
+                    problem, solution
+                )
         except Unattainable as error:
             refused = refused or error
         else:

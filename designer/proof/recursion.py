@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from agent.contract.arrays import Array
+from designer.patience import look
 from designer.proof.balls import UNDECIDED, Sign
 from designer.proof.findings import Finding, found, proved
 
@@ -69,6 +70,7 @@ def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, m
     every: list[Finding] = []
     Y, next_look = arithmetic.start(up=True), 0
     for steps in range(most + 1):
+        look(steps)
         if steps == most or steps >= next_look:
             if _seems_below(arithmetic.floats(Y), P, gamma):
                 ends = found("Y < g P", modes, arithmetic.below(Y, P, gamma), f" after {steps} steps")
@@ -94,6 +96,7 @@ def disproof(
     """
     Y, next_look = arithmetic.start(up=False), 1
     for step in range(1, most + 1):
+        look()
         if P is not None and step >= next_look:
             if _seems_below(arithmetic.floats(Y), P, gamma):
                 break
@@ -128,6 +131,7 @@ def disproof_by_leaps(
     Y, done, leapt = by.start(up=False), 0, 0
     first, between = (_FIRST, 1) if P is None else (_FIRST_OF_THRESHOLD, by.order)
     while done < most:
+        look()
         signs, Y = by.step(Y, gamma, up=False)
         done += 1
         false = [finding for finding in found("recursion", modes, signs, _at(done, gamma)) if finding.sign.refuted]

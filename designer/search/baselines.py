@@ -11,7 +11,8 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains, Solver
 from agent.contract.problem import Problem
 from designer.model.error_model import StackedGains, link_gains
-from designer.search.exact_design import certify
+from designer.patience import Budget
+from designer.search.exact_design import certify, certify_at_once
 from designer.search.starts import consensus_gains, diffusion_gains, least_variance_gains
 
 BASELINES: dict[str, Callable[[Problem], StackedGains]] = {
@@ -21,7 +22,7 @@ BASELINES: dict[str, Callable[[Problem], StackedGains]] = {
 }
 
 
-def design_baseline(problem: Problem, method: str) -> Gains:
+def design_baseline(problem: Problem, method: str, budget: Budget) -> Gains:
     """The gains of one of BASELINES with a certificate; Unattainable where they let errors grow."""
     started = time.perf_counter()
     stacked = BASELINES[method](problem)
@@ -30,7 +31,9 @@ def design_baseline(problem: Problem, method: str) -> Gains:
         raise Unattainable(f"{method} has no gains for {problem.name}: its Riccati equations have no finite solution")
     K, H = link_gains(problem, *stacked)
     try:
-        certificate = certify(problem, K, H)
+        certificate = budget.to_its_end(
+            lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H)
+        )
     except Unattainable as error:
         raise Unattainable(f"{method} is no method for {problem.name}: {error}; --method exact searches") from None
     ended = time.perf_counter()

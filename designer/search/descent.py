@@ -13,9 +13,9 @@ from T to 2 T, the search ends.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeVar
+from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,12 +25,13 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from designer.decay import Decay
 from designer.gain.exact import Gain, InvariantSet, exact_gain, horizon_gain, lyapunov, recursion_holds
+from designer.lmi.back_off import least_gamma
 from designer.model.error_model import StackedGains, error_model
+from designer.patience import Budget, TimeIsUp, looking
 from designer.search import bfgs
 from designer.search.barrier import Barrier
 from designer.search.outlook import Outlook
 
-Made = TypeVar("Made")
 _WEIGHTS = (3e-2, 9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5, 9e-6)  # mu
 NEAR = 9e-4  # the first mu where the start is near
 ROUGH = 9e-5  # the last one where some hundredths of a percent do not matter
@@ -62,7 +63,6 @@ class Progress(NamedTuple):
     horizon: int  # T; the exact gain is that of all steps
     noise: float | None = None  # E|z_tilde|^2 in hand, where that is what falls
     phase: str | None = None  # what goes on in place of a search
-    over: bool = False  # no search comes after it
     round: int = 1  # of `rounds`, one for each mu; some are gone through again over a longer horizon
     rounds: int = 0  # 0: not told
     whole: float = math.inf  # seconds that all will have taken if T stays; infinite: not told
@@ -85,6 +85,10 @@ class Candidate(NamedTuple):
 def _cost(norm: float, radius: float) -> float:
     """Size times the steps that E|eta|^2 takes to decay."""
     return norm / (1.0 - radius) if radius < 1.0 else math.inf
+
+
+def _rank_of(candidate: Candidate) -> tuple[float, float]:
+    return _rank(candidate.gain)
 
 
 def _rank(gain: Gain) -> tuple[float, float]:
@@ -113,51 +117,6 @@ class Descent(NamedTuple):
     start: str
     steps: int
     ended: str  # "converged", "interrupted", "out of time", or why there was no search
-
-
-class Budget:
-    """Seconds for a search, by a clock that may be another than that on the wall."""
-
-    def __init__(self, seconds: float = math.inf, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.seconds, self.kept, self._clock, self._begun = seconds, 0.0, clock, clock()
-
-    @property
-    def spent(self) -> float:
-        return self._clock() - self._begun
-
-    def end(self) -> None:
-        """No more time for a search."""
-        self.seconds = 0.0
-
-    def keep(self, seconds: float) -> None:
-        """So much for what comes after the search, but no more than half of all."""
-        self.kept = max(self.kept, min(seconds, self.seconds / 2.0))
-
-    def check(self, ahead: float = 0.0) -> None:
-        """TimeIsUp where it is, or will be in so many seconds."""
-        if self.spent + ahead >= self.seconds - self.kept:
-            raise TimeIsUp
-
-    def watched(self, function: bfgs.Function) -> bfgs.Function:
-        """The same, but TimeIsUp when it is."""
-
-        def watched(x: Array) -> tuple[float, Array]:
-            self.check()
-            return function(x)
-
-        return watched
-
-
-def to_its_end(work: Callable[[], Made]) -> Made:
-    """What is made after a search: Ctrl-C, which ends searches and comes once, does not end it."""
-    try:
-        return work()
-    except KeyboardInterrupt:
-        return work()
-
-
-class TimeIsUp(Exception):
-    """Ends the search, as Ctrl-C does."""
 
 
 class TooSlow(Exception):
@@ -195,14 +154,15 @@ def descend(
     search = _Search(problem, Budget() if budget is None else budget, progress, held, fewest)
     ended = "converged"
     try:
-        search.run(starts, tuple(mu for mu in _WEIGHTS if last <= mu <= first))
+        with looking(search.budget.check):
+            search.run(starts, tuple(mu for mu in _WEIGHTS if last <= mu <= first))
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:
         ended = "out of time"
     except TooSlow:
         ended = f"errors decay too slowly for a search over {search.longest} steps"
-    least, chosen = to_its_end(lambda: search.choose(starts))
+    least, chosen = search.budget.to_its_end(lambda: search.choose(starts), lambda: search.at_hand(starts))
     search.refuse_nothing(least.gain.high**2)
     return Descent(chosen, least, search.start, search.steps, ended)
 
@@ -292,7 +252,7 @@ class _Search:
         while True:
             self.budget.check()
             g = horizon_gain(operator, self.barrier.horizon, width=_NEARLY - 1.0)[1] * _NEARLY**2
-            if recursion_holds(operator, g, _LONG, invariant=invariant, look=self.budget.check).holds:
+            if recursion_holds(operator, g, _LONG, invariant=invariant).holds:
                 return
             if not self._may_be_longer():
                 raise TooSlow
@@ -306,7 +266,7 @@ class _Search:
         operator, above = self.barrier.operator(x[:-1]), 1.0 + max(_SHORT, _SHORT_OF_MU * mu)
         begun = self.budget.spent
         g, invariant = above**2 * math.exp(x[-1]), InvariantSet(P)
-        trial = recursion_holds(operator, g, _LONG, invariant=invariant, look=self.budget.check)
+        trial = recursion_holds(operator, g, _LONG, invariant=invariant)
         self.sweep = max(self.sweep, self.budget.spent - begun)
         self._keep_time()
         return trial.holds is False and self._may_be_longer()
@@ -373,7 +333,7 @@ class _Search:
             found = function(x)
             self.outlook.evaluated(self.barrier.horizon)
             if self.fewest:
-                self.budget.check(self.fewest * (self.budget.spent - begun))
+                self.budget.check(ahead=self.fewest * (self.budget.spent - begun))
                 self.fewest = 0
             return found
 
@@ -386,20 +346,46 @@ class _Search:
 
     # the choice
     def choose(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
-        """The least gain of all that was found, and the gains to take."""
+        """The least gain of all that was found, and the gains to take; fewer are compared where time is up."""
+        self.budget.goes_on(phase := "choosing among the gains found, by their exact gain")
         if self.progress is not None:
-            phase, horizon = "choosing among the gains found, by their exact gain", self.barrier.horizon
+            horizon = self.barrier.horizon
             self.progress(Progress(self.start, 0.0, self.steps, math.inf, self.budget.spent, horizon, phase=phase))
+        offered = self._offered(starts)
+        least = self._candidate(offered.pop(0))
+        while offered and not least.gain.stable:
+            least = self._less(least, offered.pop(0))
+        chosen = None
+        with suppress(TimeIsUp), looking(self.budget.check_choice):
+            for v in offered:
+                if self._may_be_less(v, least):
+                    least = self._less(least, v)
+            near = self._near(least) if least.gain.stable else None
+            chosen = None if near is None else self._candidate(near)
+        return (least, least) if chosen is None else (min(least, chosen, key=_rank_of), chosen)
+
+    def at_hand(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
+        """Gains with a bound that takes no recursion, (17) and (18) alone: the first that have one."""
+        offered = self._offered(starts) + [each.v for each in self.stable[-2::-1]]
+        for v in offered:
+            operator = self.barrier.operator(v)
+            P, decays = lyapunov(operator)
+            high = math.inf if P is None else least_gamma(operator.M, P) * (1.0 + _SHORT)
+            found = Candidate(
+                *self.barrier.entries.unpack(v), Gain(0.0, high, 1, P, decays.radius), float(np.linalg.norm(v))
+            )
+            if P is not None:
+                break
+        return found, found
+
+    def _offered(self, starts: Mapping[str, StackedGains]) -> list[Array]:
+        """v of what may be best, the likely best first; a search over too few steps may end above its start."""
         offered = [] if self.best is None else [self.best[:-1]]
-        offered += [each.v for each in self.stable[-1:]]
-        if not self.stable:
-            offered += [self.barrier.entries.pack(*gains) for gains in starts.values()]
-        least = self._candidate(offered[0])
-        for v in offered[1:]:
-            if self._may_be_less(v, least):
-                least = min(least, self._candidate(v), key=lambda candidate: _rank(candidate.gain))
-        near = self._near(least) if least.gain.stable else None
-        return least, least if near is None else self._candidate(near)
+        offered += [each.v for each in (self.stable[-1:] + self.stable[:1] if len(self.stable) > 1 else self.stable)]
+        return offered + ([] if self.stable else [self.barrier.entries.pack(*gains) for gains in starts.values()])
+
+    def _less(self, least: Candidate, v: Array) -> Candidate:
+        return min(least, self._candidate(v), key=_rank_of)
 
     def _may_be_less(self, v: Array, least: Candidate) -> bool:
         """Whether no few steps show that the gain is not below this one."""

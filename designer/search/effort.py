@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
+from designer.decay import DENSE
 from designer.search.descent import longest_horizon
 from designer.search.memory import free_memory
 from designer.search.outlook import growth
@@ -32,6 +33,9 @@ _OF_A_WINDOW = 100  # gradients of one
 _OF_THE_REST = 60  # gradients of a network in windows: start, exact gain and proof
 _OF_A_GRADIENT = 1.5e-3  # seconds, whatever the size
 _OF_A_NUMBER = 5.3e-7  # seconds of a gradient, for each of the numbers of Y_bar
+_LEFT_AT_THE_END = 8.0  # e^-8 of what there was is left where a recursion ends
+_MOST_OF_THE_END, _SOONER = 20_000, 300  # steps of it
+_RECURSIONS, _STEPS_OF_A_GRADIENT = 40, 40  # of two exact gains and a proof; as long as a gradient takes
 _WORK = 50  # matrices as large as Y_bar that the search keeps beside those of the horizon
 _WORK_OF_WINDOWS = 35  # and without a search of the whole: starts, exact gain and proof
 _OTHERS = 2e8  # bytes, whatever the size
@@ -85,6 +89,18 @@ def seconds_of_exact(problem: Problem) -> float:
 def gradients_of_exact(problem: Problem) -> float:
     """Estimated number of gradients over 20 steps, as a rule; one over 40 counts twice."""
     return _GRADIENTS * growth(problem.n) * _longer(problem)
+
+
+def seconds_of_the_end(problem: Problem) -> float:
+    """Estimated for the choice and the proof, before anything is known of how slowly errors decay at the best gains.
+
+    No faster than what the plant holds. Of few unknowns the border is known between what dies out and what grows, so
+    that recursions end early.
+    """
+    radius = min(problem.plant.spectral_radius, 1.0) ** 2 if problem.carries_plant else 0.0
+    unknowns, last = _numbers(problem, problem.n) / 2.0, _MOST_OF_THE_END
+    steps = min(_LEFT_AT_THE_END / max(1.0 - radius, _LEFT_AT_THE_END / last), last if unknowns > DENSE else _SOONER)
+    return _RECURSIONS * steps * _of_a_gradient(problem, problem.n) / _STEPS_OF_A_GRADIENT
 
 
 def _of_a_gradient(problem: Problem, n: int) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +16,26 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
-from designer.gain.exact import Gain, Operator, exact_gain, lyapunov
+from designer.gain.exact import (
+    Gain,
+    InvariantSet,
+    Operator,
+    exact_gain,
+    horizon_gain,
+    invariant_set,
+    lyapunov,
+    recursion_holds,
+)
 from designer.gain.floor import floor, floor_below
-from designer.lmi import beyond_paper
+from designer.lmi import LmiSolution, beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.findings import Verdict
-from designer.proof.prover import FLOATS, MOST_STEPS_BELOW, Prover
+from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
 from designer.proof.recursion import MOST_STEPS
-from designer.search.descent import Budget, Descent, Progress, descend, to_its_end
-from designer.search.effort import in_windows, refuse_without_memory, whole_fits
+from designer.search.descent import Descent, Progress, descend
+from designer.search.effort import in_windows, refuse_without_memory, seconds_of_the_end, whole_fits
 from designer.search.quiet import Found, quieter
 from designer.search.starts import WEIGHT, consensus_gains, ignoring, least_variance_gains
 from designer.search.windows import WEIGHT as WEIGHT_OF_WINDOWS
@@ -42,6 +54,12 @@ _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
 _STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
 _FEWEST = 400  # evaluations of the whole after windows: with less, it may lead to nothing that is stable
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
+_LMI_SECONDS, _LMI_SHARE = 2.0, 0.25  # what that takes, most of it to load; and of a search's time no more
+_AT_ONCE = 2.0  # seconds that starts may take, however little time there is
+_SHARE_OF_NOISE = 0.5  # of a search's time, where least noise is sought after the least peak
+_STEPS_AT_ONCE, _FIRST_AT_ONCE, _GROWTH_AT_ONCE = 300, 1.1, 1.3  # of a proof at once: g, and how it grows
+_HIGHEST = 1e100
+_STATES_OF_BALLS = 40  # n nx up to which they are asked at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
 
@@ -76,29 +94,20 @@ def design_exact(
             f"no gains can bound the error of {problem.name}: all sensors together do not show an unstable part of "
             "the plant that the disturbance drives, as far as floats tell; measure it"
         )
-    own, lmi_gamma, stopped = starts is None, None, False
-    if starts is None:
-        try:
-            starts, lmi_gamma = _starts(problem, held)
-        except KeyboardInterrupt:
-            if problem.plant.spectral_radius >= 1.0:
-                raise
-            own, starts, budget, stopped = False, {"ignoring all measurements": ignoring(problem)}, Budget(0.0), True
-    try:
-        lmi_exact = next(
-            (exact_gain(error_model(problem, *starts[name])).bounds for name in _LMI_STARTS if name in starts), None
-        )
-    except KeyboardInterrupt:
-        lmi_exact, budget, stopped = None, Budget(0.0), True
-    if lmi_gamma is not None and (lmi_exact is None or lmi_gamma < (1.0 - _LMI_ROUNDING) * lmi_exact[0]):
-        lmi_gamma = lmi_exact = None  # no bound of its own gains: the solver failed
+    budget.keep(seconds_of_the_end(problem))
+    own, begun_with = starts is None, _Starts(dict(starts or {}), None, None)
+    if own:
+        begun_with = _starts(problem, held, budget)
     begun = time.perf_counter()
-    if own and in_windows(problem):
-        after = _STARTS_OF_THE_END * (begun - started)
-        descent = _by_windows(problem, starts, after, budget=budget, progress=progress, dask=dask)
-    else:
-        descent = descend(problem, starts, first=first, last=last, budget=budget, progress=progress, held=held)
-    descent = descent._replace(ended="interrupted") if stopped else descent
+    with looking(budget.check_last):
+        if own and begun_with.ended is None and in_windows(problem):
+            after = _STARTS_OF_THE_END * (begun - started)
+            descent = _by_windows(problem, begun_with.gains, after, budget=budget, progress=progress, dask=dask)
+        else:
+            how: dict[str, Any] = {"first": first, "last": last, "progress": progress, "held": held}
+            with budget.leaving(_SHARE_OF_NOISE if slack else 0.0):
+                descent = descend(problem, begun_with.gains, budget=budget, **how)
+    descent = descent._replace(ended=begun_with.ended or descent.ended)
     chosen = descent.chosen
     if not chosen.gain.stable:
         raise Unattainable(
@@ -108,21 +117,24 @@ def design_exact(
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
     if slack:
-        pressed = descent.ended == "interrupted"
-        if pressed:
-            budget.end()
-        found = quieter(problem, stacked, (1.0 + slack) * gain.high, budget=budget, progress=progress, held=held)
-        found = found._replace(ended=descent.ended) if pressed else found
-        method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
-        status = f"{_status_of_noise(found, unit)}; before: {status}"
-        gain = to_its_end(lambda: exact_gain(error_model(problem, *stacked)))
+        found = _quieter(problem, descent, slack, budget, progress, held)
+        if found is None:
+            budget.left_out.append("the search for the least noise")
+        else:
+            method, steps, stacked = f"exact, peak slack {100.0 * slack:g} %", steps + found.steps, found.gains[:2]
+            status = f"{_status_of_noise(found, unit)}; before: {status}"
+            gain = found.gains.gain
     solved = time.perf_counter()
     K, H = link_gains(problem, *stacked)
+    budget.over = True
+    budget.goes_on(phase := "proving gamma", partial(_steps_of_proof, problem, stacked, gain))
     if progress is not None:
-        phase, spent = "proving gamma and the lower end of the exact gain", time.perf_counter() - started
-        progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase, over=True))
-    certificate = to_its_end(lambda: certify(problem, K, H, gain=gain))
-    certificate = certificate.model_copy(update={"lmi_gamma": lmi_gamma, "lmi_exact": lmi_exact})
+        spent = time.perf_counter() - started
+        progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase))
+    certificate = budget.to_its_end(
+        lambda: certify(problem, K, H, gain=gain, budget=budget), lambda: certify_at_once(problem, K, H)
+    )
+    certificate = certificate.model_copy(update=_of_lmi(problem, begun_with, budget))
     ended = time.perf_counter()
     return Gains.of(
         problem,
@@ -143,6 +155,34 @@ def design_exact(
     )
 
 
+def _steps_of_proof(problem: Problem, gains: StackedGains, gain: Gain) -> int | None:
+    """As floats find it; the proof takes several times as long."""
+    if gain.P is None:
+        return None
+    operator, g = Operator(error_model(problem, *gains)), (_ABOVE[4] * gain.high) ** 2
+    return recursion_holds(operator, g, MOST_STEPS, invariant=InvariantSet(gain.P)).steps
+
+
+def _quieter(
+    problem: Problem,
+    descent: Descent,
+    slack: float,
+    budget: Budget,
+    progress: Callable[[Progress], None] | None,
+    held: NDArray[np.bool_] | None,
+) -> Found | None:
+    """From what the search for the least peak chose; None where a second signal came first."""
+    pressed = descent.ended == "interrupted"
+    if pressed:
+        budget.end()
+    gains, gamma = descent.chosen[:2], (1.0 + slack) * descent.chosen.gain.high
+    budget.goes_on("measuring the noise of the gains of least peak")
+    found = budget.to_its_end(
+        lambda: quieter(problem, gains, gamma, budget=budget, progress=progress, held=held), lambda: None
+    )
+    return found._replace(ended=descent.ended) if pressed and found is not None else found
+
+
 def _by_windows(
     problem: Problem,
     starts: Mapping[str, StackedGains],
@@ -154,7 +194,7 @@ def _by_windows(
 ) -> Descent:
     """Windows first, from which the whole network's search goes on where there are time and memory for it.
 
-    `after`: the seconds that choice and proof will take. Windows may take these too: they are worth the most.
+    `after`: the seconds that choice and proof will take.
     """
 
     def report(done: int, of: int) -> None:
@@ -162,8 +202,8 @@ def _by_windows(
             phase = f"window {done} of {of}; Ctrl-C keeps what is done"
             progress(Progress("", WEIGHT_OF_WINDOWS, 0, math.inf, budget.spent, 0, phase=phase))
 
-    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
     budget.keep(after)
+    windowed = window_gains(problem, starts["least variance"], budget=budget, dask=dask, report=report)
     ended = windowed.ended or (None if whole_fits(problem) else "windows alone, for want of memory")
     if ended:
         budget.end()
@@ -172,30 +212,98 @@ def _by_windows(
     return descent._replace(ended=ended) if ended else descent
 
 
-def _starts(problem: Problem, held: NDArray[np.bool_] | None) -> tuple[dict[str, StackedGains], float | None]:
-    """Gains to start from, and gamma of the LMI where that gave one of them."""
-    starts = {"least variance": least_variance_gains(problem, held)}
-    if held is not None and problem.plant.spectral_radius < 1.0:
-        starts["ignoring all measurements"] = ignoring(problem)  # where M cancels, few gains are better
-    if lyapunov(Operator(error_model(problem, *starts["least variance"])))[0] is None:
-        starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
-    if problem.n * problem.nx > _LMI_STATES:
-        return starts, None
-    from designer.lmi import decomposed, theorem2  # cvxpy takes seconds to import
+class _Starts(NamedTuple):
+    """Gains to start from, gamma of the LMI where that gave one of them, and why there are not more."""
 
+    gains: dict[str, StackedGains]
+    lmi_gamma: float | None
+    ended: str | None
+
+
+def _starts(problem: Problem, held: NDArray[np.bool_] | None, budget: Budget) -> _Starts:
+    """Least variance first: all others take longer. KeyboardInterrupt, TimeIsUp: even that would, and others will do.
+
+    For an unstable plant there are none.
+    """
+    starts: dict[str, StackedGains] = {}
+    lmi_gamma, ended = None, None
+    until = max(budget.spent + _AT_ONCE, budget.seconds - budget.kept)
+
+    def check(steps: int) -> None:
+        if budget.asked:
+            raise KeyboardInterrupt
+        if budget.spent >= until:
+            raise TimeIsUp
+
+    try:
+        with looking(check):
+            starts["least variance"] = least_variance_gains(problem, held)
+            if held is not None and problem.plant.spectral_radius < 1.0:
+                starts["ignoring all measurements"] = ignoring(problem)  # where M cancels, few gains are better
+            if lyapunov(Operator(error_model(problem, *starts["least variance"])))[0] is None:
+                starts[f"consensus {WEIGHT}"] = consensus_gains(problem)
+            if problem.n * problem.nx <= _LMI_STATES:
+                lmi_gamma = _lmi_start(problem, starts, budget)
+    except KeyboardInterrupt:
+        ended = "interrupted"
+    except TimeIsUp:
+        ended = "out of time"
+    if not starts and problem.plant.spectral_radius < 1.0:
+        raise KeyboardInterrupt if ended == "interrupted" else TimeIsUp
+    if not starts:
+        with looking(budget.check_last):
+            starts["least variance"] = least_variance_gains(problem, held)
+    if ended is not None:
+        budget.end()
+    return _Starts(starts, lmi_gamma, ended)
+
+
+def _lmi_start(problem: Problem, starts: dict[str, StackedGains], budget: Budget) -> float | None:
+    """One start more; returns the optimum of the LMI. None: no answer, or no time to ask."""
+    if _LMI_SHARE * budget.left < _LMI_SECONDS:
+        budget.left_out.append("the gains of an LMI, to start from and to compare with")
+        return None
     name = "decomposed" if beyond_paper(problem) else "theorem2"
     try:
-        solution = decomposed.solve(problem) if beyond_paper(problem) else theorem2.solve(problem, reduced=True)
+        solution = _solved(problem, name)
         gains = recover(problem, solution)
     except Unattainable:
-        return starts, None  # one start less
+        return None  # one start less
     if np.isfinite(gains[0]).all() and np.isfinite(gains[1]).all():
         starts[name] = gains
-    return starts, solution.gamma
+    return solution.gamma
 
 
-def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | None = None) -> Certificate:
+def _solved(problem: Problem, name: str) -> LmiSolution:
+    if name == "decomposed":
+        from designer.lmi import decomposed
+
+        return decomposed.solve(problem)
+    from designer.lmi import theorem2  # cvxpy takes seconds to import
+
+    return theorem2.solve(problem, reduced=True)
+
+
+def _of_lmi(problem: Problem, begun_with: _Starts, budget: Budget) -> dict[str, Any]:
+    """What the certificate says of the LMI: its optimum, and the exact gain of its own gains."""
+    gamma, name = begun_with.lmi_gamma, next((name for name in _LMI_STARTS if name in begun_with.gains), None)
+    if name is None:
+        return {}
+    exact = budget.compared(
+        "the exact gain of the gains of an LMI",
+        lambda: exact_gain(error_model(problem, *begun_with.gains[name])).bounds,
+    )
+    if gamma is not None and (exact is None or gamma < (1.0 - _LMI_ROUNDING) * exact[0]):
+        return {}  # no bound of its own gains: the solver failed
+    return {"lmi_gamma": gamma, "lmi_exact": exact}
+
+
+def certify(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | None = None, budget: Budget | None = None
+) -> Certificate:
     """gamma just above the exact gain of any gains of (5), proved; or Unattainable. `gain`: where it is known.
+
+    Where the `budget` is over, the lower end is 0.
 
     Where M cancels, what is known of it has too few digits.
     """
@@ -214,14 +322,39 @@ def certify(problem: Problem, K: LinkMatrices, H: LinkMatrices, *, gain: Gain | 
             f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
             f"({verdict.failure})"
         )
+    low = (budget or Budget()).compared("the lower end of the exact gain", lambda: lower_end(problem, K, H, gain))
     return Certificate(
         gamma=verdict.gamma,
         kind="exact",
         form="summed",
-        exact=(lower_end(problem, K, H, gain), verdict.gamma),
+        exact=(0.0 if low is None else low, verdict.gamma),
         floor=floor_below(problem, verdict.gamma),
         holds=verdict.holds,
         verified=f"(17) for a P summed from the gains, and the recursion of the exact gain: {verdict.arithmetic}",
+        margins=verdict.margins,
+    )
+
+
+def certify_at_once(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
+    """A gamma that a recursion of few steps proves; or Unattainable.
+
+    Where errors decay slowly it is above the exact gain, of which nothing is said.
+    """
+    operator = Operator(model_of_gains(problem, K, H))
+    invariant, g = invariant_set(operator), _FIRST_AT_ONCE * horizon_gain(operator, 1)[1]
+    while invariant.P and g < _HIGHEST and not recursion_holds(operator, g, _STEPS_AT_ONCE, invariant=invariant).holds:
+        g *= _GROWTH_AT_ONCE
+    makes = FLOATS + BALLS if problem.n * problem.nx <= _STATES_OF_BALLS else FLOATS
+    verdict = Prover(problem, K, H, makes=makes).exact(math.sqrt(g) * _ABOVE[3], most=2 * _STEPS_AT_ONCE)
+    if not verdict.holds:
+        raise Unattainable(f"no gamma of the gains for {problem.name} is proved at once ({verdict.failure})")
+    return Certificate(
+        gamma=verdict.gamma,
+        kind="exact",
+        form="summed",
+        floor=None,
+        holds=verdict.holds,
+        verified=f"(17) for a P summed from the gains, and a recursion of few steps: {verdict.arithmetic}",
         margins=verdict.margins,
     )
 

@@ -20,6 +20,7 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.lmi.lmi_design import design_by_lmi
 from designer.model.units import NaturalUnits
+from designer.patience import Budget
 from designer.proof.certificate import prover_of
 from designer.search.exact_design import certify
 
@@ -28,14 +29,14 @@ _MOST = 2.0**43  # times 2^-53, and the natural unit of z: so much may a roundin
 _HELD = "entries that no file could hold are 0"
 
 
-def design_apart(problem: Problem, method: str) -> Gains | None:
+def design_apart(problem: Problem, method: str, budget: Budget | None = None) -> Gains | None:
     """None: M does not cancel, or nothing is proved of what comes of it."""
     coordinates = Coordinates.of(problem)
     if coordinates is None:
         return None
-    natural = NaturalUnits(problem, coordinates)
+    natural, budget = NaturalUnits(problem, coordinates), Budget() if budget is None else budget
     try:
-        there = design_by_lmi(natural.problem, method)
+        there = design_by_lmi(natural.problem, method, budget)
     except Unattainable:
         return None
     assert natural.magnified is not None
@@ -50,7 +51,7 @@ def design_apart(problem: Problem, method: str) -> Gains | None:
     for K_there, solver in offered:
         K, H = natural.back(K_there, there.H)
         with suppress(Unattainable):
-            return _proved(there.model_copy(update={**same, "K": K, "H": H, "solver": solver}))
+            return _proved(there.model_copy(update={**same, "K": K, "H": H, "solver": solver}), budget)
     return None
 
 
@@ -86,7 +87,7 @@ def _brought_back(certificate: Certificate, T: Array, unit: float) -> Certificat
     )
 
 
-def _proved(gains: Gains) -> Gains:
+def _proved(gains: Gains, budget: Budget) -> Gains:
     """With about the gamma that is claimed, by its P; or else with the exact gain."""
     claim, prover = gains.certificate, prover_of(gains)
     for part in _ABOVE:
@@ -94,5 +95,5 @@ def _proved(gains: Gains) -> Gains:
         if verdict.holds:
             proved = claim.model_copy(update={"gamma": verdict.gamma, "margins": verdict.margins})
             return gains.model_copy(update={"certificate": proved})
-    exact = certify(gains.problem, gains.K, gains.H).model_copy(update={"lmi_gamma": claim.lmi_gamma})
+    exact = certify(gains.problem, gains.K, gains.H, budget=budget).model_copy(update={"lmi_gamma": claim.lmi_gamma})
     return gains.model_copy(update={"certificate": exact})

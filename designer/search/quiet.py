@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from agent.contract.arrays import Array
 from agent.contract.errors import InputError
 from agent.contract.problem import Problem
-from designer.gain.exact import exact_gain
+from designer.gain.exact import Gain, exact_gain
 from designer.gain.noise import steady_state
 from designer.model.error_model import StackedGains
+from designer.patience import Budget, TimeIsUp, looking
 from designer.search import bfgs
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Progress, TimeIsUp, longest_horizon
+from designer.search.descent import Progress, longest_horizon
 from designer.search.effort import whole_fits
 from designer.search.starts import least_variance_gains
 
@@ -40,8 +41,12 @@ class Quiet(NamedTuple):
 
     K_bar: Array
     H_bar: Array
-    gamma: float
+    gain: Gain
     noise: float
+
+    @property
+    def gamma(self) -> float:
+        return self.gain.high
 
 
 class Found(NamedTuple):
@@ -75,7 +80,8 @@ def quieter(
         raise InputError(f"{problem.name}: the noise of gains of least peak has not settled, so none can be compared")
     ended = "converged"
     try:
-        search.run(search.barrier.entries.pack(*gains))
+        with looking(search.budget.check):
+            search.run(search.barrier.entries.pack(*gains))
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:
@@ -118,7 +124,7 @@ class _Search:
         noise = steady_state(model, initial=self.problem.mode_index(self.problem.markov.initial))
         if noise is None:
             return None
-        return Quiet(*self.barrier.entries.unpack(v), exact_gain(model).high, noise.total)
+        return Quiet(*self.barrier.entries.unpack(v), exact_gain(model), noise.total)
 
     def _kept(self, v: Array) -> bool:
         """Whether these gains are what is asked for; if so they are kept."""

@@ -22,6 +22,7 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator
 from designer.gain.sensitivity import Inputs
 from designer.model.error_model import Indices, StackedGains, error_model, measurement_slices, rows_total
+from designer.patience import look
 from designer.search.entries import Entries
 
 WEIGHT = 0.4  # of the neighbours' estimates together
@@ -91,6 +92,7 @@ def _predictor_gain(problem: Problem, i: int, heard: tuple[int, ...], spread: Ar
     together = owner[:, None] == owner
     P, BB = B @ B.T, B @ B.T
     for _ in range(_MOST_STEPS):
+        look()
         mean = C @ P @ C.T + D @ D.T
         innovation = arrives[:, None] * arrives * mean + (arrives * (1.0 - arrives)) * together * mean
         for j, node in enumerate(nodes):
@@ -144,6 +146,7 @@ def least_variance_gains(problem: Problem, held: NDArray[np.bool_] | None = None
     joint = np.zeros((modes, size + problem.nw, size + problem.nw))
     joint[:, size:, size:] = occupied[:, None, None] * np.eye(problem.nw)
     for _ in range(_STEPS_OF_NETWORK):
+        look()
         joint[:, :size, :size] = X
         for batch in batches:
             v[batch.at] = batch.best(joint)

@@ -17,7 +17,8 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Operator, lyapunov
 from designer.gain.products import banded_order
 from designer.model.error_model import Indices, StackedGains, error_model, measurement_slices
-from designer.search.descent import Budget, TimeIsUp, follow
+from designer.patience import Budget, TimeIsUp, looking
+from designer.search.descent import follow
 from designer.search.starts import least_variance_gains
 from designer.workers import each
 
@@ -79,16 +80,17 @@ def window_gains(
     K_bar, H_bar = (part.copy() for part in gains)
     columns, nx = measurement_slices(problem), problem.nx
     try:
-        results = each(_descended, _parts(problem, found), dask=dask)
-        for done, ((core, nodes), result) in enumerate(zip(found, results, strict=True), 1):
-            if result is not None:
-                rows = _entries(core, nx)
-                own = np.isin(_entries(nodes, nx), rows)
-                measured = np.concatenate([np.arange(columns[j].start, columns[j].stop) for j in nodes])
-                K_bar[:, rows[:, None], _entries(nodes, nx)] = result[0][:, own]
-                H_bar[:, rows[:, None], measured] = result[1][:, own]
-            report(done, len(found))
-            budget.check()
+        with looking(budget.check):
+            results = each(_descended, _parts(problem, found), dask=dask)
+            for done, ((core, nodes), result) in enumerate(zip(found, results, strict=True), 1):
+                if result is not None:
+                    rows = _entries(core, nx)
+                    own = np.isin(_entries(nodes, nx), rows)
+                    measured = np.concatenate([np.arange(columns[j].start, columns[j].stop) for j in nodes])
+                    K_bar[:, rows[:, None], _entries(nodes, nx)] = result[0][:, own]
+                    H_bar[:, rows[:, None], measured] = result[1][:, own]
+                report(done, len(found))
+                budget.check()
     except KeyboardInterrupt:
         ended = "interrupted"
     except TimeIsUp:

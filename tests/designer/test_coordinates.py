@@ -37,7 +37,6 @@ from designer.proof.by_vertices import upper_bound
 from designer.proof.certificate import verify
 from designer.proof.cube import Cube
 from designer.proof.least import at_least
-from designer.search.descent import Budget
 from designer.search.exact_design import certify, design_exact
 from designer.search.lmi_apart import design_apart
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
@@ -249,7 +248,7 @@ def test_the_search_finds_gains_that_a_file_can_hold() -> None:
     assert natural.held is not None
     assert natural.held.any()
     start = least_variance_gains(natural.problem, natural.held)
-    found = design_exact(natural.problem, starts={"start": start}, first=3e-3, budget=Budget(2.0), held=natural.held)
+    found = design_exact(natural.problem, starts={"start": start}, first=3e-3, last=3e-3, held=natural.held)
     K, H = natural.back(found.K, found.H)
     assert max(np.abs(stacked(problem, gains)).max() for gains in (K, H)) < 10.0
     idle = exact_gain(model_of_gains(problem, *link_gains(problem, *ignoring(problem)))).high

@@ -27,10 +27,11 @@ from designer.cli import main
 from designer.commands.design import design_text
 from designer.gain.exact import exact_gain
 from designer.ladder import NOMINAL, NOMINAL_IN_BOX
+from designer.patience import Budget
 from designer.problems import text_of
 from designer.proof.ball_model import told
 from designer.ranking import Rank, table
-from designer.search.descent import Budget, Progress
+from designer.search.descent import Progress
 from designer.synthesis import design, design_in_box
 
 

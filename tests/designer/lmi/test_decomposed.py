@@ -427,6 +427,9 @@ def test_a_panic_of_the_solver_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> 
         def __init__(self, *arguments: Any) -> None:
             pass
 
+        def set_termination_callback(self, callback: Any) -> None:
+            pass
+
         def solve(self) -> None:
             raise self.raised
 

@@ -7,9 +7,7 @@ and takes few.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from functools import partial
-from itertools import count
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +21,11 @@ from designer.gain.exact import Operator, exact_gain, horizon_gain
 from designer.gain.floor import floor
 from designer.model.error_model import StackedGains, error_model, link_gains, stacked_links
 from designer.model.units import Units, rescaled
+from designer.patience import Budget, TimeIsUp
 from designer.problems import find
 from designer.search import descent
 from designer.search.barrier import Barrier
-from designer.search.descent import Budget, Descent, Progress, TimeIsUp, descend, to_its_end
+from designer.search.descent import Descent, Progress, descend
 from designer.search.effort import gradients_of_exact, seconds_of_exact, seconds_within
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
 
@@ -40,9 +39,8 @@ class Counted(NamedTuple):
     told: list[Progress]
 
 
-def counted(problem: Problem) -> Counted:
-    """A descent from gains of least variance, made without any solver."""
-    told: list[Progress] = []
+def clock_of_gradients(patched: pytest.MonkeyPatch) -> Callable[[], float]:
+    """It counts those over 20 steps."""
     asked: list[float] = []
     swept = Barrier._swept
 
@@ -50,11 +48,18 @@ def counted(problem: Problem) -> Counted:
         asked.append(barrier.horizon / 20.0)
         return swept(barrier, *rest, **more)
 
+    patched.setattr(Barrier, "_swept", counting)
+    return lambda: sum(asked)
+
+
+def counted(problem: Problem) -> Counted:
+    """A descent from gains of least variance, made without any solver."""
+    told: list[Progress] = []
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Barrier, "_swept", counting)
-        budget, start = Budget(clock=lambda: sum(asked)), {"least variance": least_variance_gains(problem)}
+        clock = clock_of_gradients(patched)
+        budget, start = Budget(clock=clock), {"least variance": least_variance_gains(problem)}
         found = descend(problem, start, budget=budget, progress=told.append)
-    return Counted(problem, found, sum(asked), [progress for progress in told if progress.phase is None])
+    return Counted(problem, found, clock(), [progress for progress in told if progress.phase is None])
 
 
 @pytest.fixture(scope="module")
@@ -202,13 +207,13 @@ def test_an_interrupted_search_keeps_the_best_so_far() -> None:
 
 
 @pytest.mark.parametrize("evaluations", [0, 1, 60])
-def test_what_there_is_is_kept_when_time_is_over(evaluations: int) -> None:
-    """By a clock that counts how often it is asked: no worse than the start, and better once there are steps."""
+def test_what_there_is_is_kept_when_time_is_over(evaluations: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that counts gradients: no worse than the start, and better once there are steps."""
     problem = find("two-nodes")
     start = random_gains(problem, 0, size=0.1)
     before = exact_gain(error_model(problem, *start))
-    asked = count(-1.0)  # 0 when the budget begins
-    found = descend(problem, {"random": start}, budget=Budget(evaluations, clock=lambda: next(asked)))
+    budget = Budget(evaluations, clock=clock_of_gradients(monkeypatch))
+    found = descend(problem, {"random": start}, budget=budget)
     assert found.ended == "out of time"
     assert before.stable
     assert (found.steps == 0) == (evaluations < 2)
@@ -247,19 +252,12 @@ def test_a_search_that_sees_nothing_of_a_slow_decay_is_not_tried(
 
 
 @pytest.mark.parametrize(("fewest", "steps"), [(30, 0), (10, 1)])
-def test_a_search_that_comes_to_nothing_in_its_time_is_not_tried(fewest: int, steps: int) -> None:
+def test_a_search_that_comes_to_nothing_in_its_time_is_not_tried(
+    fewest: int, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By a clock that knows evaluations alone, of which there is time for twenty, and for a step."""
-    problem, asked = find("two-nodes"), []
-    swept = Barrier._swept
-
-    def counting(barrier: Barrier, *rest: Any, **more: Any) -> Any:
-        asked.append(1.0)
-        return swept(barrier, *rest, **more)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Barrier, "_swept", counting)
-        budget = Budget(20.0, clock=lambda: sum(asked))
-        found = descend(problem, {"near": least_variance_gains(problem)}, budget=budget, fewest=fewest)
+    problem, budget = find("two-nodes"), Budget(20.0, clock=clock_of_gradients(monkeypatch))
+    found = descend(problem, {"near": least_variance_gains(problem)}, budget=budget, fewest=fewest)
     assert found.ended == "out of time"
     assert (found.steps > 0) == (steps > 0)
 
@@ -289,11 +287,11 @@ def test_a_near_start_passes_over_the_first_weights() -> None:
     assert again.least.gain.high <= whole.least.gain.high * (1.0 + 1e-4)
 
 
-def test_a_large_network_goes_below_least_variance_within_a_few_steps() -> None:
+def test_a_large_network_goes_below_least_variance_within_a_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """40 nodes are in several groups of rows."""
     problem = banded(40)
     start = least_variance_gains(problem)
-    budget = Budget(40.0, clock=partial(next, count(-1.0)))
+    budget = Budget(40.0, clock=clock_of_gradients(monkeypatch))
     found = descend(problem, {"least variance": start}, budget=budget)
     assert found.chosen.gain.high < 0.95 * exact_gain(error_model(problem, *start)).high
 
@@ -311,14 +309,3 @@ def test_a_budget_keeps_a_share_for_the_proof() -> None:
     budget.keep(1000.0)
     assert budget.kept == 50.0
     Budget().keep(1000.0)  # no end, no share
-
-
-def test_what_comes_after_a_search_is_not_ended_by_what_ended_it() -> None:
-    to_come: list[type[BaseException]] = [KeyboardInterrupt]
-
-    def work() -> int:
-        if to_come:
-            raise to_come.pop()
-        return 7
-
-    assert to_its_end(work) == 7

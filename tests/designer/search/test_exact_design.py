@@ -12,11 +12,11 @@ from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.model.error_model import error_model
+from designer.patience import Budget
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
 from designer.search import descent, effort, exact_design
-from designer.search.descent import Budget
 from designer.search.exact_design import design_exact
 from designer.search.starts import least_variance_gains
 from designer.search.windows import Windowed
@@ -139,11 +139,22 @@ def test_ctrl_c_in_any_phase_leaves_gains_that_are_certified(phase: str, monkeyp
     assert verify(gains).holds
 
 
-def test_ctrl_c_before_the_search_is_not_called_a_want_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_that_nobody_heeds_ends_a_design_that_has_nothing_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a notebook; who heeds signals tells the budget, and gets gains."""
+
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(exact_design, "_starts", interrupted)
-    gains = design_exact(find("two-nodes"))
-    assert gains.solver.status.startswith("interrupted; from ignoring all measurements")
+    monkeypatch.setattr(exact_design, "least_variance_gains", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        design(find("two-nodes"))
+
+
+@pytest.mark.parametrize("asked", [0, 1, 2])
+def test_no_time_at_all_leaves_gains_that_are_certified(asked: int) -> None:
+    budget = Budget(1e-9)
+    budget.asked = asked
+    gains = design(find("two-nodes"), budget=budget)
+    assert ("ignore all measurements" in gains.solver.status) == (asked > 0)
+    assert "the floor" in budget.left_out
     assert verify(gains).holds
