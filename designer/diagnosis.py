@@ -14,7 +14,7 @@ relaxed in turn to see which of them is in the way. docs/theory.md, section 10.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ def obstacles(problem: Problem) -> list[str]:
                 heard = np.flatnonzero(upstream[i])
                 if _blind(problem, eigenvalue, heard):
                     text = _blind_text(problem, i, eigenvalue, modes, sees)
-                    found += _as_proved(text, problem, [int(j) for j in heard], chance=1.0)
+                    found += _as_proved(text, problem, [int(j) for j in heard])
                 else:
                     found += _too_many_losses(problem, i, eigenvalue, sees, upstream[i], adjacency[i])
     found += [] if found else _too_fast(problem)
@@ -108,13 +108,13 @@ def _scaled(problem: Problem) -> tuple[Array, list[Array]]:
     return problem.plant.A * units / units[:, None], [node.C * units for node in problem.nodes]
 
 
-def _as_proved(text: str, problem: Problem, blind: list[int], *, chance: float) -> list[str]:
-    """The sentence that with this chance in each step nothing shows what grows, as nodes `blind` never show it.
+def _as_proved(text: str, problem: Problem, blind: list[int], lost: Sequence[float] = ()) -> list[str]:
+    """The sentence that nothing shows what grows when nothing arrives of what arrives with probabilities `lost`.
 
-    None where exact arithmetic says otherwise.
+    Nodes `blind` never show it. None where exact arithmetic says otherwise.
     """
     C = np.vstack([problem.nodes[j].C for j in blind]) if blind else np.zeros((0, problem.nx))
-    proved = grows_unseen(problem.plant.A, C, chance)
+    proved = grows_unseen(problem.plant.A, C, lost)
     return [] if proved is False else [text if proved else text + _COMPUTED]
 
 
@@ -194,14 +194,15 @@ def _too_many_losses(
                 f"with probability {beta[eyes[0]]:g}: {_growth(lost, factor)}; "
                 f"arrival_probability must be above {1.0 - 1.0 / factor:.6g}"
             )
-            return _as_proved(text, problem, blind, chance=lost)
+            return _as_proved(text, problem, blind, [beta[j] for j in eyes])
         text = (
             f"the measurements of nodes {names}, which alone see the unstable part of the plant ({unstable}), are all "
             f"lost together with probability {lost:.6g}: {_growth(lost, factor)}; raise their arrival_probability"
         )
-        return _as_proved(text, problem, blind, chance=lost)
+        return _as_proved(text, problem, blind, [beta[j] for j in eyes])
     senders = [j for j in range(problem.n) if hears[j] and j != i]
-    cut = float(np.prod([1.0 - problem.delivery[i, j] for j in senders])) * (1.0 - beta[i] if sees[i] else 1.0)
+    ways = [*(problem.delivery[i, j] for j in senders), *([beta[i]] if sees[i] else [])]
+    cut = float(np.prod([1.0 - p for p in ways]))
     if senders and cut * factor >= 1.0:
         name = problem.node_names[i]
         own = ", as is its own measurement," if sees[i] else ""
@@ -210,7 +211,7 @@ def _too_many_losses(
             f"{own} with probability {cut:.6g}: against the unstable part of the plant ({unstable}), "
             f"{_growth(cut, factor)}; raise their delivery_probability"
         )
-        return _as_proved(text, problem, [] if sees[i] else [i], chance=cut)
+        return _as_proved(text, problem, [] if sees[i] else [i], ways)
     return []
 
 

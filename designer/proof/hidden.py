@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import prod
+
 from flint import acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from agent.contract.arrays import Array
@@ -9,8 +12,10 @@ from agent.contract.arrays import Array
 _BITS = 256
 
 
-def grows_unseen(A: Array, C: Array, chance: float) -> bool | None:
+def grows_unseen(A: Array, C: Array, lost: Sequence[float] = ()) -> bool | None:
     """Whether chance |lambda|^2 >= 1 for an eigenvalue of A on the subspace that C does not show; None: not decided.
+
+    chance is that nothing arrives of what arrives with these probabilities, the product of all 1 - p.
 
     A (nx, nx), C (rows, nx) with any number of rows. The subspace, all v with C A^k v = 0 for every k, is rational, and
     so is A on it; its eigenvalues are enclosed in balls. Where they lie on the border, +1 and -1 are looked at exactly.
@@ -21,14 +26,15 @@ def grows_unseen(A: Array, C: Array, chance: float) -> bool | None:
         return False
     on_it = (hidden.transpose() * hidden).inv() * (hidden.transpose() * exact * hidden)
     size = on_it.nrows()
-    if chance == 1.0 and any(_is_eigenvalue(on_it, root) for root in (1, -1)):
+    if not any(lost) and any(_is_eigenvalue(on_it, root) for root in (1, -1)):
         return True
     with ctx.workprec(_BITS):
         try:
             values = acb_mat(arb_mat(on_it)).eig(multiple=True)
         except ValueError:
             return None
-        sizes = [arb(chance) * abs(value) ** 2 for value in values]
+        chance = prod((1 - arb(p) for p in lost), start=arb(1))
+        sizes = [chance * abs(value) ** 2 for value in values]
         if any(size >= 1 for size in sizes):
             return True
         return False if len(values) == size and all(size < 1 for size in sizes) else None

@@ -379,23 +379,24 @@ def test_a_sensor_that_shows_what_grows_a_little_is_no_obstacle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("A", "C", "chance", "grows"),
+    ("A", "C", "lost", "grows"),
     [
-        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 1.0, True),
-        ([[1.2, 0.0], [0.0, 0.5]], [[1.0, 0.0]], 1.0, False),
-        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 0.69, False),  # 1.44 x 0.69 < 1
-        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], 0.7, True),
-        ([[1.2, 0.0], [0.0, 0.5]], [[1e-300, 1.0]], 1.0, False),
-        ([[1.0, 1.0], [0.0, 1.0]], [[0.0, 0.0]], 1.0, True),  # a double integrator, on the border
-        ([[0.0, 1.0], [-1.0, 0.0]], [[0.0, 0.0]], 1.0, True),  # and a rotation
-        ([[0.0, 1.5], [-1.5, 0.0]], [[0.0, 0.0]], 1.0, True),
-        ([[1.2, 0.0], [0.0, 0.5]], [], 0.5, False),
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], [], True),
+        ([[1.2, 0.0], [0.0, 0.5]], [[1.0, 0.0]], [0.0], False),
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], [0.31], False),  # 1.44 x 0.69 < 1
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0, 1.0]], [0.3], True),
+        ([[1.2, 0.0], [0.0, 0.5]], [[1e-300, 1.0]], [], False),
+        ([[1.0, 1.0], [0.0, 1.0]], [[0.0, 0.0]], [0.0], True),  # a double integrator, on the border
+        ([[0.0, 1.0], [-1.0, 0.0]], [[0.0, 0.0]], [0.0], True),  # and a rotation
+        ([[0.0, 1.5], [-1.5, 0.0]], [[0.0, 0.0]], [0.0], True),
+        ([[1.2, 0.0], [0.0, 0.5]], [], [0.5], False),
+        ([[2.0, 0.0], [0.0, 0.5]], [], [0.42, 0.4, 0.03, 0.25939092309515355], False),  # 0.25, if rounded
     ],
 )
 def test_what_grows_unseen_is_decided_exactly(
-    A: list[list[float]], C: list[list[float]], chance: float, grows: bool
+    A: list[list[float]], C: list[list[float]], lost: list[float], grows: bool
 ) -> None:
-    assert grows_unseen(np.array(A), np.array(C).reshape(-1, 2), chance) is grows
+    assert grows_unseen(np.array(A), np.array(C).reshape(-1, 2), lost) is grows
 
 
 # what one node needs that hears nobody
