@@ -51,6 +51,10 @@ _FAR_BELOW = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)  # and by steps: a W fails afte
 SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
+_SOON_IN_BALLS, _FEWER_STATES = (
+    500,
+    20,
+)  # steps and n nx that balls take in a second: asked before gamma is larger by more
 _STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
 _FEWEST = 400  # evaluations of the whole after windows: with less, it may lead to nothing that is stable
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
@@ -391,10 +395,11 @@ def confirmed(problem: Problem, K: LinkMatrices, H: LinkMatrices, high: float, *
 
     P satisfies (17); without one it is summed from the gains.
     """
-    by_floats = Prover(problem, K, H, P=P, makes=FLOATS)
-    soon = [(by_floats, _SOON, _A_LITTLE_LARGER)] if problem.n * problem.nx <= _FEW_STATES else []
-    at_length = [(prover, MOST_STEPS, _ABOVE) for prover in (by_floats, Prover(problem, K, H, P=P))]
-    for prover, most, factors in (*soon, *at_length):
+    by_floats, by_both = Prover(problem, K, H, P=P, makes=FLOATS), Prover(problem, K, H, P=P)
+    states, tried = problem.n * problem.nx, list[tuple[Prover, int, tuple[float, ...]]]()
+    tried += [(by_floats, _SOON, _A_LITTLE_LARGER)] if states <= _FEW_STATES else []
+    tried += [(by_both, _SOON_IN_BALLS, _A_LITTLE_LARGER[1:])] if states <= _FEWER_STATES else []
+    for prover, most, factors in (*tried, (by_floats, MOST_STEPS, _ABOVE), (by_both, MOST_STEPS, _ABOVE)):
         for factor in factors:
             verdict = prover.exact(high * factor, most=most)
             if verdict.holds:

@@ -17,7 +17,7 @@ from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
 from designer.search import descent, effort, exact_design
-from designer.search.exact_design import design_exact
+from designer.search.exact_design import confirmed, design_exact
 from designer.search.starts import least_variance_gains
 from designer.search.windows import Windowed
 from designer.synthesis import design
@@ -158,3 +158,19 @@ def test_no_time_at_all_leaves_gains_that_are_certified(asked: int) -> None:
     assert ("ignore all measurements" in gains.solver.status) == (asked > 0)
     assert "the floor" in budget.left_out
     assert verify(gains).holds
+
+
+@pytest.mark.parametrize(("floats", "above"), [(1e-6, 1e-6), (1e-5, 1e-5), (1e-4, 1e-6)])
+def test_of_small_networks_floats_cost_no_digits(floats: float, above: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they do not prove a gamma that is hardly above the exact gain, balls are asked for it first."""
+    high, asked = 0.4, exact_design.FLOATS
+
+    class Asked:
+        def __init__(self, *of: Any, makes: Any = None, **more: Any) -> None:
+            self._room = floats if makes is asked else 0.9e-6
+
+        def exact(self, gamma: float, *, most: int) -> Verdict:
+            return Verdict(gamma >= high * (1.0 + self._room) * (1.0 - 1e-15), gamma, "", None, {})
+
+    monkeypatch.setattr(exact_design, "Prover", Asked)
+    assert confirmed(alone(0.8), {}, {}, high).gamma == pytest.approx(high * (1.0 + above), rel=1e-12)
