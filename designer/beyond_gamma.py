@@ -32,6 +32,7 @@ class BeyondGamma(NamedTuple):
     noise: SteadyState | None
     gains: list[tuple[float, float]] | None  # of every node's own error
     start: FromStart | None = None  # None: the problem has no initial error
+    sought: bool = True  # the noise
 
     def document(self) -> dict[str, Any]:
         """For --json."""
@@ -45,6 +46,7 @@ class BeyondGamma(NamedTuple):
                 "nodes": dict(zip(self.names, (noise.nodes / self.weights**2).tolist(), strict=True)),
                 "relative_error": noise.error,
             },
+            "white_noise_sought": self.sought,
             "start": None if self.start is None else self.start.document(),
             "node_gains": None
             if gains is None
@@ -56,18 +58,22 @@ def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | 
     """For any gains, with the P that their certificate stores; nothing where they are not mean-square stable."""
     model = model_of_gains(problem, K, H)
     initial, states = problem.mode_index(problem.markov.initial), problem.n * problem.nx
-    noise = steady_state(model, initial=initial) if states <= _MOST_OF_NOISE else None
+    sought = states <= _MOST_OF_NOISE
+    noise = steady_state(model, initial=initial) if sought else None
     gains = node_gains(model) if states <= _MOST_STATES else None
-    return BeyondGamma(problem.node_names, problem.weights, noise, gains, from_start(problem, K, H, P))
+    return BeyondGamma(problem.node_names, problem.weights, noise, gains, from_start(problem, K, H, P), sought)
 
 
 def told(facts: dict[str, Any]) -> list[str]:
     """`BeyondGamma.document` for people: the noise, then a line for each node, of many for those that have most."""
     noise, gains = facts["white_noise"], facts["node_gains"] or {}
     if noise is None:
-        never = f"; of more than {_MOST_OF_NOISE} states n nx it is not sought"
-        not_found = f"noise      what white w leaves in the steady state was not found{never}"
-        return [not_found, *from_there(facts.get("start"))]
+        why = (
+            "was not found"
+            if facts["white_noise_sought"]
+            else f"is not sought of more than {_MOST_OF_NOISE} states n nx"
+        )
+        return [f"noise      what white w leaves in the steady state {why}", *from_there(facts.get("start"))]
     found = [f"noise      E|z~|^2 = {noise['mean_square']:.6g} in the steady state under white w of unit covariance"]
     order = sorted(noise["nodes"], key=lambda name: -noise["nodes"][name])
     names = list(noise["nodes"]) if len(order) <= _FEW else order[:_FEW]

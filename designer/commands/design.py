@@ -202,7 +202,11 @@ def design_and_save(
         "floor": proved.floor,
         "ladder": (ladder if found is None else found.on(ladder)).document(),
         "within": None if found is None else found.document(),
-        **({"white_noise": None, "start": None, "node_gains": None} if beyond is None else beyond.document()),
+        **(
+            dict.fromkeys(("white_noise", "white_noise_sought", "start", "node_gains"))
+            if beyond is None
+            else beyond.document()
+        ),
         "holds": proved.holds,
         "solver": gains.solver.document(),
         "seconds": gains.seconds,
