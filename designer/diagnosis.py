@@ -33,6 +33,7 @@ _SCALES = 1e6
 _DEPENDENT = 1e-9  # relative to the sizes of A and C: below this, a singular value is 0
 _ONE_BY_ONE = 100  # n nx modes up to which nodes and links are relaxed one by one
 _COMPUTED = "; this is computed, not proved"
+_HARDLY = ", as far as floats tell; by exact numbers it is not so, if only just"
 
 
 def warnings(problem: Problem) -> list[str]:
@@ -71,7 +72,8 @@ def explained(problem: Problem, error: Unattainable, solvable: Callable[[Problem
     if not _growing(problem):
         known = "a solution exists, since the plant is stable: to ignore all measurements is one"
         return Unattainable("; ".join([str(error), known, *warnings(problem)]))
-    found = [sentence for relaxed, sentence in _relaxed_one_by_one(problem) if solvable(relaxed)]
+    found = [sentence for sentence in _suspected(problem) if sentence.endswith(_HARDLY)]
+    found = found or [sentence for relaxed, sentence in _relaxed_one_by_one(problem) if solvable(relaxed)]
     if not found:
         found = [sentence for relaxed, sentence in _relaxed_together(problem) if solvable(relaxed)][:1]
     found += [sentence for mode, sentence in _mode_by_mode(problem) if not solvable(mode)]
@@ -85,6 +87,11 @@ def obstacles(problem: Problem) -> list[str]:
     Floats find each, in natural units; what exact arithmetic proves false is left out, and what it does not prove says
     that it is computed.
     """
+    return [sentence for sentence in _suspected(problem) if not sentence.endswith(_HARDLY)]
+
+
+def _suspected(problem: Problem) -> list[str]:
+    """The same, with what exact arithmetic proves false."""
     found: list[str] = []
     for eigenvalue, V in _growing(problem):
         sees = [bool(np.abs(C @ V).max() > _DEPENDENT * np.abs(C).max()) for C in _scaled(problem)[1]]
@@ -98,7 +105,7 @@ def obstacles(problem: Problem) -> list[str]:
                     found += _as_proved(text, problem, [int(j) for j in heard])
                 else:
                     found += _too_many_losses(problem, i, eigenvalue, sees, upstream[i], adjacency[i])
-    found += [] if found else _too_fast(problem)
+    found += _too_fast(problem) if all(sentence.endswith(_HARDLY) for sentence in found) else []
     return list(dict.fromkeys(found))
 
 
@@ -111,11 +118,11 @@ def _scaled(problem: Problem) -> tuple[Array, list[Array]]:
 def _as_proved(text: str, problem: Problem, blind: list[int], lost: Sequence[float] = ()) -> list[str]:
     """The sentence that nothing shows what grows when nothing arrives of what arrives with probabilities `lost`.
 
-    Nodes `blind` never show it. None where exact arithmetic says otherwise.
+    Nodes `blind` never show it.
     """
     C = np.vstack([problem.nodes[j].C for j in blind]) if blind else np.zeros((0, problem.nx))
     proved = grows_unseen(problem.plant.A, C, lost)
-    return [] if proved is False else [text if proved else text + _COMPUTED]
+    return [text + {True: "", False: _HARDLY, None: _COMPUTED}[proved]]
 
 
 def _growing(problem: Problem) -> list[tuple[complex, Array]]:
