@@ -11,7 +11,7 @@ from networks import random_problem, real_networks
 
 from designer import beyond_gamma as module
 from designer.beyond_gamma import beyond_gamma, told
-from designer.gain.exact import exact_gain, node_gains
+from designer.gain.exact import Operator, exact_gain, node_gains
 from designer.model.error_model import error_model, link_gains
 from designer.search.starts import ignoring, least_variance_gains
 
@@ -49,10 +49,14 @@ def test_it_is_told_node_by_node(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_large_networks_and_errors_that_grow_go_without(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = random_problem(3)
-    monkeypatch.setattr(module, "_MOST_STATES", 1)
+    monkeypatch.setattr(module, "_FEW_STATES", 1)
+    assert beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem))).gains is not None
+    operator = Operator(error_model(problem, *least_variance_gains(problem)))
+    numbers = problem.n * operator.MM.size  # as many are few enough only if errors decay at once
+    monkeypatch.setattr(module, "_MOST_OF_NODES", 1.01 * numbers)
     small = beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem)))
     assert small.gains is None
-    assert "exact gain" not in "\n".join(told(small.document()))
+    assert told(small.document())[-1].startswith("  the exact gain of each node is not sought: with more than")
     monkeypatch.setattr(module, "_MOST_OF_NOISE", 1)
     assert beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem))).noise is None
     monkeypatch.undo()
@@ -60,4 +64,4 @@ def test_large_networks_and_errors_that_grow_go_without(monkeypatch: pytest.Monk
     grows = beyond_gamma(problem, *link_gains(problem, 3.0 * K_bar, H_bar))
     assert (grows.noise, grows.gains) == (None, None)
     said = "what white w leaves in the steady state was not found; of more than 500 states n nx it is not sought"
-    assert told(grows.document()) == [f"noise      {said}"]
+    assert told(grows.document()) == [f"noise      {said}, nor is each node's gain"]
