@@ -5,6 +5,7 @@ Gamma is of the worst w and of all nodes together. Gains whose gamma is a little
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from designer.model.error_model import model_of_gains
 from designer.start import FromStart, from_start
 from designer.start import told as from_there
 
-_MOST_STATES = 40  # n nx up to which the gain of each node is worth its time
+_FEW_STATES, _MOST_OF_NODES = 40, 5e6  # n nx up to which, and work up to which the gain of each node is worth its time
+_LONG = f"with more than {_FEW_STATES} states n nx, so many nodes and errors so slow it takes too long"
 _MOST_OF_NOISE = 500  # n nx up to which the noise is worth its time, and the memory that its equation takes
 _FEW = 8  # nodes that get a line each; of more, as many
 
@@ -60,7 +62,7 @@ def beyond_gamma(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array | 
     initial, states = problem.mode_index(problem.markov.initial), problem.n * problem.nx
     sought = states <= _MOST_OF_NOISE
     noise = steady_state(model, initial=initial) if sought else None
-    gains = node_gains(model) if states <= _MOST_STATES else None
+    gains = node_gains(model, most=math.inf if states <= _FEW_STATES else _MOST_OF_NODES)
     return BeyondGamma(problem.node_names, problem.weights, noise, gains, from_start(problem, K, H, P), sought)
 
 
@@ -71,7 +73,7 @@ def told(facts: dict[str, Any]) -> list[str]:
         why = (
             "was not found"
             if facts["white_noise_sought"]
-            else f"is not sought of more than {_MOST_OF_NOISE} states n nx"
+            else f"is not sought of more than {_MOST_OF_NOISE} states n nx, nor is each node's gain"
         )
         return [f"noise      what white w leaves in the steady state {why}", *from_there(facts.get("start"))]
     found = [f"noise      E|z~|^2 = {noise['mean_square']:.6g} in the steady state under white w of unit covariance"]
@@ -83,4 +85,6 @@ def told(facts: dict[str, Any]) -> list[str]:
         found.append(f"  node {name:{width}}  {gain}E|z - z^|^2 = {noise['nodes'][name]:.6g}; computed")
     if len(order) > _FEW:
         found.append(f"  and {len(order) - _FEW} nodes with less noise: --json has all")
+    if not gains:
+        found.append(f"  the exact gain of each node is not sought: {_LONG}")
     return found + from_there(facts.get("start"))

@@ -260,13 +260,19 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def node_gains(model: ErrorModel) -> list[tuple[float, float]] | None:
+def node_gains(model: ErrorModel, *, most: float = math.inf) -> list[tuple[float, float]] | None:
     """The exact gain to every node's own error z - z_hat_i, [low, high] each, with the gains of all as they are.
 
-    M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable.
+    M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable, or
+    more work than `most`: numbers of Y for every node, as many times as errors take steps to decay.
     """
     operator = Operator(model)
+    work = len(model.rows) * operator.MM.size
+    if work > most:
+        return None
     decays = decay(operator.corner, model.modes, operator.units, operator.model.moves)
+    if math.isfinite(most) and work > most * (1.0 - decays.radius):
+        return None
     invariant = invariant_set(operator, decays)
     if not invariant.P:
         return None

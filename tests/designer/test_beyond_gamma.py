@@ -11,7 +11,7 @@ from networks import random_problem, real_networks
 
 from designer import beyond_gamma as module
 from designer.beyond_gamma import beyond_gamma, told
-from designer.gain.exact import exact_gain, node_gains
+from designer.gain.exact import Operator, exact_gain, node_gains
 from designer.model.error_model import error_model, link_gains
 from designer.search.starts import ignoring, least_variance_gains
 
@@ -49,14 +49,18 @@ def test_it_is_told_node_by_node(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_large_networks_and_errors_that_grow_go_without(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = random_problem(3)
-    monkeypatch.setattr(module, "_MOST_STATES", 1)
+    monkeypatch.setattr(module, "_FEW_STATES", 1)
+    assert beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem))).gains is not None
+    operator = Operator(error_model(problem, *least_variance_gains(problem)))
+    numbers = problem.n * operator.MM.size  # as many are few enough only if errors decay at once
+    monkeypatch.setattr(module, "_MOST_OF_NODES", 1.01 * numbers)
     small = beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem)))
     assert small.gains is None
-    assert "exact gain" not in "\n".join(told(small.document()))
+    assert told(small.document())[-1].startswith("  the exact gain of each node is not sought: with more than")
     monkeypatch.setattr(module, "_MOST_OF_NOISE", 1)
     large = beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem)))
     assert large.noise is None
-    assert told(large.document())[0].endswith(" is not sought of more than 1 states n nx")
+    assert told(large.document())[0].endswith(" is not sought of more than 1 states n nx, nor is each node's gain")
     monkeypatch.undo()
     K_bar, H_bar = ignoring(problem)
     grows = beyond_gamma(problem, *link_gains(problem, 3.0 * K_bar, H_bar))
