@@ -167,7 +167,7 @@ def _beside(problem: Problem) -> dict[str, Any]:
     parts = [("plant", problem.plant), *((node.name, node) for node in problem.nodes)]
     parts += [(f"{link.sender} to {link.receiver}", link) for link in problem.links or ()]
     said = [(f" of {name}", part.tolerance) for name, part in (*parts, ("markov", problem.markov))]
-    found = {
+    found: dict[str, Any] = {
         "weights": {node.name: node.weight for node in problem.nodes if node.weight is not None},
         "initial_error": None if problem.plant.initial_error is None else problem.plant.initial_error.tolist(),
         "tolerances": {

@@ -7,7 +7,6 @@ import numpy as np
 from agent.contract.errors import counted, listed
 from agent.contract.problem import Problem
 
-
 _ROUNDED = 1e-6  # of the largest eigenvalue, and at all: less is 0, of which floats keep half the digits
 
 

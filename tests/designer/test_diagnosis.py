@@ -464,7 +464,7 @@ def test_a_continuous_time_matrix_is_noted() -> None:
         ([[-0.9, 0.0], [0.0, 0.9]], None),
     ],
 )
-def test_integrators_oscillators_and_what_falls_over_are_noted_delays_are_not(A: list[list[float]], said: str | None) -> None:
+def test_integrators_and_what_falls_over_are_noted_and_delays_are_not(A: list[list[float]], said: str | None) -> None:
     seen = [{**node, "loss": "seen"} for node in random_problem(4).document()["node"]]
     document = random_problem(4).document() | {"unbiased": True, "node": seen}
     document["plant"]["A"] = A
