@@ -164,7 +164,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
 
 def _beside(problem: Problem) -> dict[str, Any]:
     """What may stand beside the numbers of a problem, where it does."""
-    parts = [("plant", problem.plant), *((node.name, node) for node in problem.nodes)]
+    parts: list[tuple[str, Any]] = [("plant", problem.plant), *((node.name, node) for node in problem.nodes)]
     parts += [(f"{link.sender} to {link.receiver}", link) for link in problem.links or ()]
     said = [(f" of {name}", part.tolerance) for name, part in (*parts, ("markov", problem.markov))]
     found: dict[str, Any] = {
