@@ -13,6 +13,6 @@ other answers   analysis: somebody else's gains; ranking: gains beside others; s
                 for each mode; what_if: without a node or a link; sweep: over values of a key; reproduce: the paper's
                 table; simulation: thousands of runs; show: what a file is; compare: two recordings beside each other
                 conformity: the networks that a program is tried in which takes a node's place
-the machine     workers: many designs or runs at once; patience: budgets, and who asks for an end; coordinates: states in which
-                M does not cancel; cli: the program
+the machine     workers: many designs or runs at once; patience: budgets, and who asks for an end; coordinates: states in
+                which M does not cancel; cli: the program
 """

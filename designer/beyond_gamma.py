@@ -6,6 +6,7 @@ Gamma is of the worst w and of all nodes together. Gains whose gamma is a little
 from __future__ import annotations
 
 import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,6 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.gain.exact import node_gains
 from designer.gain.noise import SteadyState, steady_state
-from designer.ladder import rounded_up
 from designer.model.error_model import model_of_gains
 from designer.start import FromStart, from_start
 from designer.start import told as from_there
@@ -24,6 +24,8 @@ _FEW_STATES, _MOST_OF_NODES = 40, 5e6  # n nx up to which, and work up to which 
 _LONG = f"with more than {_FEW_STATES} states n nx, so many nodes and errors so slow it takes too long"
 _MOST_OF_NOISE = 500  # n nx up to which the noise is worth its time, and the memory that its equation takes
 _FEW = 8  # nodes that get a line each; of more, as many
+_UP, _DOWN = (Context(prec=4, rounding=way) for way in (ROUND_CEILING, ROUND_FLOOR))  # a gain is known to a 10000th
+_WIDE = 1e-3  # relative: where a search has not come to its end both ends are told
 
 
 class BeyondGamma(NamedTuple):
@@ -81,10 +83,16 @@ def told(facts: dict[str, Any]) -> list[str]:
     names = list(noise["nodes"]) if len(order) <= _FEW else order[:_FEW]
     width = max(map(len, names))
     for name in names:
-        gain = f"exact gain {rounded_up(gains[name][1])}, " if name in gains else ""
+        gain = f"exact gain {_known(*gains[name])}, " if name in gains else ""
         found.append(f"  node {name:{width}}  {gain}E|z - z^|^2 = {noise['nodes'][name]:.6g}; computed")
     if len(order) > _FEW:
         found.append(f"  and {len(order) - _FEW} nodes with less noise: --json has all")
     if not gains:
         found.append(f"  the exact gain of each node is not sought: {_LONG}")
     return found + from_there(facts.get("start"))
+
+
+def _known(low: float, high: float) -> str:
+    """A gain, with no more digits than are known of it."""
+    up = f"{_UP.create_decimal_from_float(high):g}"
+    return up if high <= low * (1.0 + _WIDE) else f"between {_DOWN.create_decimal_from_float(low):g} and {up}"

@@ -155,10 +155,28 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "sees_its_losses": [node.name for node in problem.nodes if node.seen],
         "lossy_links": {f"{link.sender} to {link.receiver}": link.delivery_probability for link in problem.links or ()},
         "unbiased": bool(problem.unbiased),
+        **_beside(problem),
         "disturbance": problem.disturbance.kind,
         "notes": notes(problem),
         "digest": problem.digest(),
     }
+
+
+def _beside(problem: Problem) -> dict[str, Any]:
+    """What may stand beside the numbers of a problem, where it does."""
+    parts: list[tuple[str, Any]] = [("plant", problem.plant), *((node.name, node) for node in problem.nodes)]
+    parts += [(f"{link.sender} to {link.receiver}", link) for link in problem.links or ()]
+    said = [(f" of {name}", part.tolerance) for name, part in (*parts, ("markov", problem.markov))]
+    found: dict[str, Any] = {
+        "weights": {node.name: node.weight for node in problem.nodes if node.weight is not None},
+        "initial_error": None if problem.plant.initial_error is None else problem.plant.initial_error.tolist(),
+        "tolerances": {
+            f"{key}{of}": size for of, sizes in said if sizes is not None for key, size in sizes.document().items()
+        },
+    }
+    if problem.uncertainty is not None:
+        found["tolerances"] |= {f"all {name}": size for name, size in problem.uncertainty.document().items()}
+    return {name: value for name, value in found.items() if value}
 
 
 def _sampled(plant: Plant) -> dict[str, Any]:

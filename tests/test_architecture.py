@@ -65,7 +65,7 @@ ROOMS = {
     "designer.single_run": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.proof "
     "designer.single_run",
-    "designer.beyond_gamma": "designer.gain designer.ladder designer.model designer.start",
+    "designer.beyond_gamma": "designer.gain designer.model designer.start",
     "designer.box": "designer.coordinates designer.decay designer.gain designer.invariants designer.ladder "
     "designer.model designer.patience designer.proof designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "

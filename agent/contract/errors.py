@@ -122,6 +122,7 @@ _WANTED = {  # what pydantic asks for, as a person says it who writes TOML
     "tuple_type": "must be a list",
     "list_type": "must be a list",
     "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
     "too_short": "must not be empty",
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,6 +17,9 @@ from agent.contract.tables import table
 FORMAT = "peakmesh-gains"
 VERSION = 1
 _ENERGY = 1e-9  # that of `worst_case` may be off 1 by
+
+Gamma = Annotated[Number, Field(gt=1e-150, lt=1e150)]  # so that gamma^2 is a float64
+Share = Annotated[Number, Field(ge=0.0, le=1.0)]
 
 # gains[mode][i][j]: node i receives from node j; only where a_ij > 0 in that mode
 LinkMatrices = dict[str, dict[str, dict[str, Matrix]]]
@@ -40,14 +43,14 @@ class BoxClaim(Model):
     proof makes its weights from there, by `start` and `rounds` (`designer.box.weights`), and believes none of it.
     """
 
-    gamma: Number | None = Field(default=None, gt=1e-150, lt=1e150)  # None: none is proved, and that is why:
+    gamma: Gamma | None = None  # None: none is proved, and that is why:
     why_not: str | None = None
     found: Number | None = None  # the exact gain of the worst model that was found; None: it is not stable
     ends: tuple[bool, ...]
     rows: tuple[int, ...]
     signs: tuple[int, ...]
     start: int = Field(default=0, strict=True, ge=0)
-    rounds: tuple[tuple[Number, Number], ...] = ()  # gamma and share of each
+    rounds: tuple[tuple[Gamma, Share], ...] = Field(default=(), max_length=100)
 
 
 class Certificate(Model):
@@ -59,9 +62,9 @@ class Certificate(Model):
     Theorem 1's gamma for the same P beside its own.
     """
 
-    gamma: Number = Field(gt=1e-150, lt=1e150)  # so that gamma^2 is a float64; the least that is proved
+    gamma: Gamma  # the least that is proved
     kind: Literal["lyapunov", "exact"]
-    theorem1_gamma: Number | None = Field(default=None, gt=1e-150, lt=1e150)  # kind "exact": proved too, by (18)
+    theorem1_gamma: Gamma | None = None  # kind "exact": proved too, by (18)
     form: Literal["structured", "full", "summed"]  # summed: P is not stored; who verifies sums it from the gains
     R: Matrix | None = None  # structured: P(s) = diag{R, Q_1(s), ..., Q_n(s)}, each (nx, nx); None with e alone
     Q: dict[str, dict[str, Matrix]] | None = None  # Q[mode][node]

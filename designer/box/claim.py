@@ -43,12 +43,12 @@ def again(gains: Gains, *, balls: bool = False) -> Robust | None:
     if box is None:
         raise InputError("certificate: box: the problem has no tolerances, so there is nothing to claim of its box")
     truth = truth_at(gains.problem, box, *_fitting(claim, box))
-    gain = math.inf if claim.found is None else claim.found
+    gain = gain_of(gains.problem, gains.K, gains.H, box, truth)
     worst = Worst(truth, gain, claim.ends, claim.rows, claim.signs)
     recipe = Recipe(claim.start, tuple(Round(*each) for each in claim.rounds))
     verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, recipe, balls=balls)
     said = Robust(box, worst, verdict, recipe)
-    if said.gamma is not None or not gain_of(gains.problem, gains.K, gains.H, box, truth) <= claim.gamma:
+    if said.gamma is not None or not gain <= claim.gamma:
         return said
     own = robust(gains.problem, gains.K, gains.H, box, balls=balls)
     if own.gamma is None or own.gamma > claim.gamma:

@@ -19,7 +19,8 @@ def add_within(parser: argparse.ArgumentParser, what: str = "prove gamma for eve
         default=[],
         metavar="NAME=SIZE",
         help=f"{what}, in place of the one that the problem has: probabilities=0.02, or 2%% of each, for those of "
-        "arrival and delivery that are below 1; transition=0.05, total variation of each row; may be repeated",
+        "arrival and delivery that are below 1; transition=0.05, total variation of each row; A,B,C,D,M=1%%, or a "
+        "number, of each entry; may be repeated",
     )
 
 

@@ -7,6 +7,8 @@ import numpy as np
 from agent.contract.errors import counted, listed
 from agent.contract.problem import Problem
 
+_ROUNDED = 1e-6  # of the largest eigenvalue, and at all: less is 0, of which floats keep half the digits
+
 
 def notes(problem: Problem) -> list[str]:
     """Each a sentence: a matrix of continuous time, a column of w that is several things at once."""
@@ -14,11 +16,19 @@ def notes(problem: Problem) -> list[str]:
 
 
 def _continuous(problem: Problem) -> list[str]:
-    if not (np.linalg.eigvals(problem.plant.A).real < 0.0).all():
+    found = np.linalg.eigvals(problem.plant.A)
+    real, size = found.real, float(np.abs(found).max())
+    if (real < 0.0).all():
+        what = "every eigenvalue of A has a negative real part"
+    elif size > _ROUNDED and (real <= _ROUNDED * size).all():  # integrators, or oscillators
+        what = "no eigenvalue of A has a positive real part"
+    elif (real < -1.0).any():
+        what = f"the real part {real.min():.4g} of an eigenvalue of A is below -1"
+    else:
         return []
     return [
-        "every eigenvalue of A has a negative real part, as of a continuous-time model; A must be of "
-        "x(k+1) = A x(k) + B w(k), exp(A T) of a plant that is sampled every T"
+        f"{what}, as of a continuous-time model; A must be of x(k+1) = A x(k) + B w(k), exp(A T) of a plant that is "
+        "sampled every T"
     ]
 
 

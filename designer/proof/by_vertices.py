@@ -26,6 +26,7 @@ Flags = NDArray[np.bool_]
 
 _ABOVE = 1e-10  # of its own size Z stands above what floats find: more than they err by
 _OUTWEIGHS = 4.0  # times what S(Y) may be off by in floats, Z stands above that too
+_ROUNDED = 1e-6  # of the largest entry of Z: what is less may be rounding, and is not what Z lacks by itself
 _LEAST = 1e-13  # of the largest eigenvalue of a weight
 
 
@@ -141,7 +142,8 @@ def upper_bound(S: Array, X: Array) -> Array:
     else:
         d, X, S = _in_units(S, X)
         Z = symmetric(_folded(S, X).Z)
-        D = weights(Z.diagonal(axis1=1, axis2=2))
+        sizes = Z.diagonal(axis1=1, axis2=2)
+        D = weights(np.maximum(sizes, _ROUNDED * sizes.max(axis=1, keepdims=True)))
         lacking = -np.linalg.eigvalsh((Z - S) * D[:, :, None] * D[:, None, :])[..., 0].min(axis=0)
         Z, D = Z * d[:, :, None] * d[:, None, :], D / d
     i = np.arange(Z.shape[1])

@@ -39,12 +39,31 @@ def test_it_is_told_node_by_node(monkeypatch: pytest.MonkeyPatch) -> None:
     noise = facts["white_noise"]
     assert noise["mean_square"] == pytest.approx(sum(noise["nodes"].values()))
     assert len(told(facts)) == 1 + problem.n
-    assert f"node n1  exact gain {facts['node_gains']['n1'][1]:.4f}"[:-1] in told(facts)[2]
+    low, high = facts["node_gains"]["n1"]
+    shown = float(told(facts)[2].split("exact gain ")[1].split(",")[0])
+    assert high <= shown < 1.001 * low
     assert f"E|z - z^|^2 = {noise['nodes']['n1']:.6g}; computed" in told(facts)[2]
     monkeypatch.setattr(module, "_FEW", 1)
     worst = max(noise["nodes"], key=lambda name: noise["nodes"][name])
     assert f"node {worst}" in told(facts)[1]
     assert told(facts)[2:] == ["  and 2 nodes with less noise: --json has all"]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (63.99, 64.0148, "64.02"),  # no digit that the other end denies
+        (1.0, 1.0, "1"),
+        (0.043824, 0.043828, "0.04383"),
+        (0.5, 0.75, "between 0.5 and 0.75"),
+        (0.123456, 2000001.0, "between 0.1234 and 2.001e+6"),
+    ],
+)
+def test_no_more_digits_of_a_gain_are_told_than_are_known(low: float, high: float, said: str) -> None:
+    problem = random_problem(2)
+    facts = beyond_gamma(problem, *link_gains(problem, *least_variance_gains(problem))).document()
+    facts["node_gains"]["n1"] = [low, high]
+    assert f"node n1  exact gain {said}, E|z" in told(facts)[2]
 
 
 def test_large_networks_and_errors_that_grow_go_without(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -463,3 +463,23 @@ def test_a_continuous_time_matrix_is_noted() -> None:
     assert found.startswith("every eigenvalue of A has a negative real part, as of a continuous-time model; A must be")
     document["plant"]["A"] = [[0.01, -0.992], [0.0, -0.75]]
     assert not any("continuous" in text for text in notes(Problem.from_document(document)))
+
+
+@pytest.mark.parametrize(
+    ("A", "said"),
+    [
+        ([[0.0, 1.0], [0.0, -0.5]], "no eigenvalue of A has a positive real part"),  # a mass with friction
+        ([[0.0, 0.7], [-0.7, 0.0]], "no eigenvalue of A has a positive real part"),  # an oscillator
+        ([[0.0, 1.0], [9.81, -0.1]], "the real part -3.182 of an eigenvalue of A is below -1"),  # an inverted pendulum
+        ([[0.0, 1.0], [0.0, 0.0]], None),  # two steps of delay
+        ([[0.0, 0.0], [0.0, 0.0]], None),
+        ([[1.1, 1.0], [0.0, 0.9]], None),
+        ([[-0.9, 0.0], [0.0, 0.9]], None),
+    ],
+)
+def test_integrators_and_what_falls_over_are_noted_and_delays_are_not(A: list[list[float]], said: str | None) -> None:
+    seen = [{**node, "loss": "seen"} for node in random_problem(4).document()["node"]]
+    document = random_problem(4).document() | {"unbiased": True, "node": seen}
+    document["plant"]["A"] = A
+    found = [text for text in notes(Problem.from_document(document)) if "continuous" in text]
+    assert [text.split(", as of")[0] for text in found] == ([] if said is None else [said])

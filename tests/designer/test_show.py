@@ -52,6 +52,22 @@ def test_what_real_networks_have_is_described(tmp_path: Path) -> None:
     assert re.search("sees its losses +-\nlossy links +-\nunbiased +no\n", plain)
 
 
+def test_what_is_said_beside_the_numbers_is_described() -> None:
+    problem = find("zhu2020-lossy").with_(
+        plant={"initial_error": [0.1, 0.0], "tolerance": {"A": "1%"}},
+        node={"2": {"weight": 0.1, "tolerance": {"arrival_probability": [0.05, "2%"], "D": [[0.1]]}}},
+        markov={"tolerance": {"transition": 0.05}},
+        uncertainty={"probabilities": 0.02},
+    )
+    text = show.text(show._problem(problem))
+    assert re.search("weights +2: 0.1\n", text)
+    assert re.search("initial error +0.1, 0\n", text)
+    said = ("A of plant: 1%", "D of 2: 0.1", "arrival_probability of 2: 0.05, 2%", "transition of markov: 0.05")
+    assert re.search(f"tolerances +{'; '.join((*said, 'all probabilities: 0.02'))}\n", text)
+    plain = show.text(show.describe("zhu2020-lossy"))
+    assert not re.search("weights|initial error|tolerances", plain)
+
+
 def test_without_a_file_the_built_in_problems_are_listed() -> None:
     facts = show.describe()
     assert facts["problems"]["zhu2020-ideal"] == "4 nodes, 2 states, 4 modes"

@@ -37,7 +37,7 @@ def tolerance(value: Any, most: float = math.inf) -> Tolerance:
         about = math.nan
     if (isinstance(value, str) and not part) or not 0.0 <= about <= (100.0 if part else most) or math.isinf(about):
         limit = "0 or more" if math.isinf(most) else f"from 0 to {most:g}"
-        raise ValueError(f'{shortened(value)} is no tolerance; it is a number {limit}, or a part such as "2%"')
+        raise ValueError(f'{shortened(value)} is no tolerance; it is a number {limit}, or a part up to "100%"')
     if about == 0.0:  # what is too small for a float64 has a numerator of as many digits as it likes
         return Tolerance(Fraction(0), part)
     return Tolerance(Fraction(str(text)) / (100 if part else 1), part)
@@ -58,7 +58,11 @@ def _probability(value: Any) -> Any:
 def _rows(value: Any) -> Any:
     """Total variation, of each row or of all."""
     for size in value if isinstance(value, list | tuple) else [value]:
-        if tolerance(size, most=1.0).relative:
+        try:
+            part = tolerance(size, most=1.0).relative
+        except ValueError:
+            part = True
+        if part:
             raise ValueError(f"{shortened(size)} is no total variation; it is a number from 0 to 1, such as 0.05")
     return list(value) if isinstance(value, list | tuple) else value
 

@@ -112,11 +112,21 @@ def test_a_claim_below_what_a_model_of_the_box_has_is_refused(
         ({"ends": []}, "ends has 0 entries"),
         ({"rows": [1]}, "names a corner that a row of the transition matrix does not have"),
         ({"signs": [2, 1, 1]}, "signs are -1, 0 or 1"),
+        ({"rounds": [[1e300, 0.4]]}, "rounds number 1 number 1: must be less than 1e"),
+        ({"rounds": [[1.0, 1.5]]}, "rounds number 1 number 2: must be at most 1, got 1.5"),
+        ({"rounds": [[1.0, 0.4]] * 101}, "rounds: .* 100 items"),
     ],
 )
 def test_a_claim_that_is_not_about_the_box_is_refused(changes: dict[str, Any], sentence: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=sentence):
         again(Gains.load(edited(tmp_path, **changes)))
+
+
+@pytest.mark.parametrize("lie", [0.1, 10.0, None])
+def test_the_worst_that_is_said_to_be_found_is_computed_again(lie: float | None, tmp_path: Path) -> None:
+    found = again(Gains.load(edited(tmp_path, found=lie)))
+    assert found is not None
+    assert found.found == pytest.approx(claimed().certificate.box.found, rel=1e-4)  # type: ignore[union-attr]
 
 
 def test_a_claim_without_tolerances_is_refused() -> None:

@@ -28,7 +28,7 @@ from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, Ladder
 from designer.model.error_model import error_model, stacked_gains
 from designer.proof.ball_model import Truth
 from designer.proof.by_floats import ByFloats
-from designer.proof.by_vertices import ByVertices, prove
+from designer.proof.by_vertices import ByVertices, prove, upper_bound
 from designer.proof.cube import Cube
 from designer.proof.prover import Prover
 
@@ -171,6 +171,19 @@ def test_a_step_stands_above_the_mean_of_every_model_by_every_outcome(name: str)
         for s, mode in enumerate(problem.mode_names):
             Y_bar = sum(float(pi) * Y_t for pi, Y_t in zip(truth.transition[s], Y, strict=True))
             assert np.linalg.eigvalsh(Z[s] - moment_of(gains, mode, truth, np.asarray(Y_bar)))[0] > -1e-9
+
+
+def test_an_entry_that_is_rounding_alone_does_not_raise_the_others() -> None:
+    """As of errors that hardly move: what is above all corners there is measured by the whole, not by itself."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        F, G = rng.normal(size=(1, 4, 4)), rng.normal(size=(3, 1, 4, 4))
+        G[..., 3, :] *= 1e-9
+        X, S = F @ F.swapaxes(-1, -2) + np.eye(4), G @ G.swapaxes(-1, -2)
+        without = upper_bound(S[..., :3, :3], X[..., :3, :3])
+        Z = upper_bound(S, X)
+        assert np.linalg.eigvalsh(Z - S).min() > -1e-14
+        assert np.trace(X[0] @ Z[0]) < 1.0001 * np.trace(X[0, :3, :3] @ without[0])
 
 
 # mutants
