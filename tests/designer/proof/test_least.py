@@ -20,6 +20,7 @@ from designer.model.error_model import error_model
 from designer.problems import find
 from designer.proof import least, silent
 from designer.proof.least import at_least
+from designer.proof.reachable import seen_from
 from designer.proof.silent import at_least_by_silence, least_again
 from designer.search.starts import node_regression
 from designer.synthesis import design
@@ -82,7 +83,7 @@ def test_no_gains_leave_less_of_a_regression(problem: Problem) -> None:
 def residual(problem: Problem, s: int, i: int, moments: Array) -> Array:
     with least.ctx.workprec(256):
         (V,) = least.symmetric(moments[None])
-        Res = least._residual(least.regression(problem, s, i), V, np.arange(len(moments)))
+        Res = least._residual(least.regression(problem, s, i, seen_from(problem)), V, np.ones(len(moments), dtype=bool))
         return np.array([float(entry.mid()) for entry in Res.entries()]).reshape(problem.nx, problem.nx)
 
 
