@@ -15,6 +15,7 @@ from flint import fmpq, fmpq_mat
 
 from agent.contract.arrays import Array
 from agent.contract.problem import Problem
+from agent.contract.problem.parts import CONTINUOUS
 from designer.coordinates import fractions
 
 
@@ -49,6 +50,23 @@ def pivots(basis: fmpq_mat) -> Array:
     for k in range(basis.ncols()):
         T[k, next(j for j in range(basis.nrows()) if basis[j, k] != 0)] = 1.0
     return T
+
+
+def on_reachable(problem: Problem) -> tuple[Problem | None, Array]:
+    """The problem on states that say all that w brings about, rounded, and T (r, nx) that picks them; None: none."""
+    basis = reachable(problem)
+    if basis.ncols() == problem.nx or not basis.ncols():
+        return (problem if basis.ncols() else None), np.eye(problem.nx)
+    T = pivots(basis)
+    seen = seen_from(problem, T)
+    assert seen is not None
+    matrices = {name: np.asarray(getattr(seen, name), dtype=np.float64) for name in ("A", "B", "M")}
+    plant = problem.plant.model_copy(update={**dict.fromkeys(CONTINUOUS), **matrices, "initial_error": None})
+    nodes = [
+        node.model_copy(update={"C": np.asarray(C, dtype=np.float64)})
+        for node, C in zip(problem.certain().nodes, seen.C, strict=True)
+    ]
+    return problem.certain().model_copy(update={"plant": plant, "nodes": tuple(nodes)}), T
 
 
 def seen_from(problem: Problem, T: Array | None = None) -> Seen | None:
