@@ -31,7 +31,7 @@ MOST_NUMBERS = 20_000  # of the weights of all modes: a file has other things in
 _KEPT, _APART = 0.3, 0.3  # of moments in each step; and of those of each error once more, but of no two together
 _STEPS, _SETTLED, _BOUNDLESS = 300, 1e-7, 1e100
 _NOTHING = 1e-9  # of the largest moments: w does not reach this error in this mode
-_SPARE = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)  # of the weights, those that have much to spare
+_SPARE = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)  # of the weights, those that have much to spare
 _DIGITS = 3  # of the weights in a file, more than that part has
 _STEPS_OF_SOLVER, _IN_A_SECOND = 25, 2e9  # multiplications
 
