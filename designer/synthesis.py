@@ -37,7 +37,7 @@ EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate 
 _PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
 _SMALLEST = 1e-40  # and its inverse: products of some such numbers are far from the ends of float64
 SHARE_OF_BOX = 0.5  # of a search's time
-_SHARE_OF_WEIGHTS = 0.001  # of the budget, for what no gains are below by an LMI
+_SHARE_OF_WEIGHTS = 0.002  # of the budget, for what no gains are below by an LMI
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
@@ -164,8 +164,10 @@ def _of_lmi(gains: Gains, budget: Budget) -> dict[str, Any]:
         return {}
     from designer.undercut import Undercut, undercut  # scipy takes long to import
 
-    seconds = _SHARE_OF_WEIGHTS * budget.seconds
-    least = budget.compared("the least that the LMI can give", lambda: undercut(gains.problem, seconds=seconds))
+    seconds, offered = _SHARE_OF_WEIGHTS * budget.seconds, gains.certificate.lmi_weights
+    least = budget.compared(
+        "the least that the LMI can give", lambda: undercut(gains.problem, offered=offered, seconds=seconds)
+    )
     gamma, weights, why_not = least or Undercut(None, why_not="time was up, or a signal came")
     return {"lmi_least": gamma, "lmi_weights": weights, "lmi_why_not": why_not}
 

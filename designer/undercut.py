@@ -3,7 +3,8 @@
 The multipliers of the LMI's balance are the best weights, up to a solver's tolerance. So they are mixed with a little
 of weights that have much to spare: the moments of a network under white noise, each of whose nodes takes the gains of
 least variance, and of which a part is forgotten in every step. The LMI is solved for states in which these moments are
-near the identity: there, what a solver misses is as small beside them in every direction.
+near the identity: there, what a solver misses is as small beside them in every direction. Where a design has solved the
+LMI in states of its own, its multipliers are tried first.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.lmi import conic, decomposed
 from designer.lmi.attempts import SOLVED
-from designer.model.units import NaturalUnits
+from designer.model.units import NaturalUnits, Units
 from designer.patience import look
 from designer.proof.least import at_least
-from designer.proof.reachable import on_reachable
+from designer.proof.reachable import between, on_reachable
 from designer.proof.silent import at_least_by_silence
 from designer.search.effort import in_words
 from designer.search.starts import Greedy
 
-MOST_NUMBERS = 20_000  # of the weights of all modes: a file has other things in it
 _KEPT, _APART = 0.3, 0.3  # of moments in each step; and of those of each error once more, but of no two together
 _STEPS, _SETTLED, _BOUNDLESS = 300, 1e-7, 1e100
 _NOTHING = 1e-9  # of the largest moments: w does not reach this error in this mode
 _SPARE = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)  # of the weights, those that have much to spare
 _DIGITS = 3  # of the weights in a file, more than that part has
-_STEPS_OF_SOLVER, _IN_A_SECOND = 25, 2e9  # multiplications
+_LITTLE = 1e-5  # of that, beside which better weights are not worth a solver's time
+_OF_SQUARES = 1.5e-6  # seconds that a solver takes, over the squares of the numbers in a matrix of each inequality
 
 
 class Undercut(NamedTuple):
@@ -52,51 +53,81 @@ class _Seen(NamedTuple):
     spare: Array
 
 
-def undercut(problem: Problem, *, seconds: float = math.inf) -> Undercut:
-    """The largest that is proved. There is no search for weights that is estimated to take a solver more `seconds`."""
+def undercut(problem: Problem, *, offered: Weights | None = None, seconds: float = math.inf) -> Undercut:
+    """The largest that is proved.
+
+    `offered`: multipliers of an LMI that was solved in other states, perhaps as good as better ones. These take a
+    solver; where it is estimated to take more `seconds`, they are not sought.
+    """
     silent = at_least_by_silence(problem)
     try:
-        found = _by_weights(problem, seconds)
+        found = _by_weights(problem, offered, seconds)
     except np.linalg.LinAlgError as error:
         found = Undercut(None, why_not=f"floats found no weights: {error}")
     return Undercut(silent) if silent is not None and silent >= (found.gamma or 0.0) else found
 
 
-def _by_weights(problem: Problem, seconds: float) -> Undercut:
+def _by_weights(problem: Problem, offered: Weights | None, seconds: float) -> Undercut:
+    numbers = decomposed.numbers_of_weights(problem)
+    if numbers > decomposed.MOST_WEIGHTS:
+        why = f"it takes {numbers} weights, and a file keeps at most {decomposed.MOST_WEIGHTS}"
+        return Undercut(None, why_not=why)
     seen = _seen(problem)
     if seen is None:
         return Undercut(None, why_not="no weights have anything to spare")
-    modes, order = seen.spare.shape[:2]
-    numbers = modes * order * (order + 1) // 2
-    if numbers > MOST_NUMBERS:
-        return Undercut(None, why_not=f"it takes {numbers} weights; for a file {MOST_NUMBERS} are enough")
+    V = None if offered is None else _moved(problem, offered, seen.T)
+    found = Undercut(None) if V is None else _mixed(problem, seen, V, most=_LITTLE)
+    if found.gamma is not None:
+        return found
     lmi = decomposed.assemble(seen.problem)
-    estimated = _STEPS_OF_SOLVER * sum((cone * (cone + 1) / 2) ** 3 for cone in lmi.cones.orders) / 3.0 / _IN_A_SECOND
-    if estimated > seconds:
-        return Undercut(None, why_not=f"it would take about {in_words(estimated)}; a larger --budget allows that")
+    estimated = _OF_SQUARES * sum((cone * (cone + 1) / 2) ** 2 for cone in lmi.cones.orders)
+    if estimated <= seconds:
+        found = _solved(problem, seen, lmi)
+    else:
+        why = f"better weights would take about {in_words(estimated)}, which a larger --budget allows"
+        found = Undercut(None, why_not=why)
+    further = Undercut(None) if V is None or found.gamma is not None else _mixed(problem, seen, V)
+    return found if further.gamma is None else further
+
+
+def _solved(problem: Problem, seen: _Seen, lmi: decomposed.Lmi) -> Undercut:
     objective = np.zeros(lmi.cones.A.shape[1])
     objective[lmi.delta] = 1.0
     answer = conic.clarabel(lmi.cones, objective)
     if answer.record.status not in SOLVED or answer.z is None:
         return Undercut(None, why_not=f"a solver says {answer.record.status} of the LMI")
-    return _mixed(problem, seen, decomposed.multipliers(seen.problem, lmi, answer.z))
+    units = Units(np.ones(seen.problem.nx), 1.0)
+    return _mixed(problem, seen, decomposed.multipliers(seen.problem, lmi, answer.z, units))
 
 
-def _mixed(problem: Problem, seen: _Seen, V: Array) -> Undercut:
-    """With as little of those that have much to spare, and as few digits, as prove anything."""
+def _moved(problem: Problem, weights: Weights, T: Array) -> Array | None:
+    """The weights, of states T x."""
+    V = weights.matrices(problem.mode_names)
+    try:
+        S = between(weights.states, T)
+    except ZeroDivisionError:
+        return None
+    blocks = [S] * ((V.shape[1] - problem.nw) // problem.nx)
+    whole = np.zeros((sum(len(block) for block in blocks) + problem.nw, V.shape[1]))
+    for k, block in enumerate(blocks):
+        whole[k * len(S) : (k + 1) * len(S), k * problem.nx : (k + 1) * problem.nx] = block
+    whole[len(whole) - problem.nw :, V.shape[1] - problem.nw :] = np.eye(problem.nw)
+    return np.asarray(whole @ V @ whole.T)
+
+
+def _mixed(problem: Problem, seen: _Seen, V: Array, *, most: float = math.inf) -> Undercut:
+    """With as little of those that have much to spare, and as few digits, as prove anything; with no more than that."""
     w = slice(V.shape[1] - problem.nw, None)
     spare = np.where(V != 0.0, seen.spare, 0.0)
     spare *= np.trace(V[:, w, w], axis1=1, axis2=2).sum() / np.trace(spare[:, w, w], axis1=1, axis2=2).sum()
     live = np.asarray(spare.any(axis=2))
     V = np.where(live[:, :, None] & live[:, None], V, 0.0)  # what w does not reach has to be 0
-    for part in _SPARE:
+    for part in (part for part in _SPARE if part <= most):
         look()
         mixed = _rounded((1.0 - part) * V + part * spare, _DIGITS - round(math.log10(part)))
         gamma = at_least(problem, mixed, seen.T)
         if gamma is not None:
-            by_mode = zip(problem.mode_names, mixed, strict=True)
-            rows = {mode: tuple(row[: k + 1] for k, row in enumerate(V_s)) for mode, V_s in by_mode}
-            return Undercut(gamma, Weights(states=seen.T, V=rows))
+            return Undercut(gamma, Weights.of(seen.T, mixed, problem.mode_names))
     return Undercut(None, why_not="no weights were found that prove any")
 
 

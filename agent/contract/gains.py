@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -59,6 +60,21 @@ class Weights(Model):
 
     states: Matrix  # T, (r, nx): r of them are what w brings about
     V: dict[str, tuple[Vector, ...]]
+
+    @classmethod
+    def of(cls, states: Array, V: Array, modes: Sequence[str]) -> Self:
+        """V (modes, order, order), symmetric."""
+        rows = {mode: tuple(row[: k + 1] for k, row in enumerate(V_s)) for mode, V_s in zip(modes, V, strict=True)}
+        return cls(states=states, V=rows)
+
+    def matrices(self, modes: Sequence[str]) -> Array:
+        """V again."""
+        order = len(self.V[modes[0]])
+        V = np.zeros((len(modes), order, order))
+        for V_s, mode in zip(V, modes, strict=True):
+            for k, row in enumerate(self.V[mode]):
+                V_s[k, : k + 1] = V_s[: k + 1, k] = row
+        return V
 
 
 class Certificate(Model):

@@ -42,6 +42,7 @@ from designer.model.error_model import measurement_slices
 from designer.model.units import Units, natural_units, rescaled
 
 Link = tuple[int, int]  # (i, j): node i hears node j
+MOST_WEIGHTS = 20_000  # multipliers that are kept: a file that has them has other things in it
 MARGIN = 1e-6  # of the balance, for unstable plants: designer.lmi.inwards knows no way inwards there
 
 
@@ -146,15 +147,19 @@ def _run(
     lmi = assemble(rescaled(problem, units), margin=margin, error=units.error)
     q = np.zeros(lmi.cones.A.shape[1])
     q[lmi.delta] = 1.0
-    u, record, _ = solver(lmi.cones, q)
-    return record, _solution(problem, lmi, u, units, record) if record.status in SOLVED else None
+    u, record, z = solver(lmi.cones, q)
+    if record.status not in SOLVED:
+        return record, None
+    solution = _solution(problem, lmi, u, units, record)
+    if z is not None and numbers_of_weights(problem) <= MOST_WEIGHTS:
+        solution = solution._replace(weights=multipliers(problem, lmi, z, units))
+    return record, solution
 
 
 def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lmi:
     """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance.
 
-    Errors are measured in units `error` times as large as the state's: what
-    x and w do to them is divided by it.
+    Errors are measured in units `error` times as large as the state's: what x and w do to them is divided by it.
     """
     build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
     delta, R = build.unknown(1, 1), build.symmetric(problem.plant_states)
@@ -335,7 +340,13 @@ def _peak(build: Assembly, problem: Problem, i: int, Q: Indices, delta: Indices)
     return matrix
 
 
-def multipliers(problem: Problem, lmi: Lmi, z: Array) -> Array:
+def numbers_of_weights(problem: Problem) -> int:
+    """How many `multipliers` has."""
+    order = problem.plant_states + problem.n * problem.nx + problem.nw
+    return len(problem.topologies) * order * (order + 1) // 2
+
+
+def multipliers(problem: Problem, lmi: Lmi, z: Array, units: Units) -> Array:
     """Those of the balance, (modes, n_eta + nw, n_eta + nw), over [x; e; w]; 0 where no piece has two of them.
 
     Pieces agree where they meet, but for the solver's tolerance: the mean is taken.
@@ -352,7 +363,8 @@ def multipliers(problem: Problem, lmi: Lmi, z: Array) -> Array:
             V[s][np.ix_(at, at)] += lmi.cones.piece(z, piece.matrix.number)[np.ix_(rows, rows)]
             pieces[np.ix_(at, at)] += 1.0
         V[s] /= np.maximum(pieces, 1.0)
-    return V
+    own = [np.tile(units.state, p // nx), np.tile(units.error * units.state, problem.n), np.ones(problem.nw)]
+    return V * (sizes := np.concatenate(own)) * sizes[:, None]
 
 
 def _solution(problem: Problem, lmi: Lmi, u: Array, units: Units, record: Solver) -> LmiSolution:

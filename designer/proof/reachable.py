@@ -88,6 +88,11 @@ def seen_from(problem: Problem, T: Array | None = None) -> Seen | None:
     )
 
 
+def between(T: Array, other: Array) -> Array:
+    """S (r, nx) with S T = `other`, T (nx, nx) regular, rounded; ZeroDivisionError where it is not."""
+    return np.asarray(_fractions(rational(other) * rational(T).inv()), dtype=np.float64)
+
+
 def rational(matrix: Any) -> fmpq_mat:
     """The floats or fractions of a matrix, each as it is."""
     rows, columns = np.shape(matrix)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
-from agent.contract.arrays import Array
-from agent.contract.gains import Certificate, Gains, Weights
+from agent.contract.gains import Certificate, Gains
 from designer.proof.least import at_least
 from designer.proof.silent import at_least_by_silence
 
@@ -35,7 +31,7 @@ def least_again(gains: Gains) -> LeastAgain | None:
         return LeastAgain(True, "no node sees some disturbance")
     if weights is None:
         return LeastAgain(None, "no weights are stored that would show it")
-    proved = at_least(gains.problem, whole(weights, gains.problem.mode_names), weights.states)
+    proved = at_least(gains.problem, weights.matrices(gains.problem.mode_names), weights.states)
     if proved is not None and proved >= claim.lmi_least:
         return LeastAgain(True, "by the weights on (17) that are stored")
     return LeastAgain(False, f"its weights show {'nothing' if proved is None else f'no more than {proved}'}")
@@ -43,13 +39,3 @@ def least_again(gains: Gains) -> LeastAgain | None:
 
 def _less(claim: Certificate) -> bool:
     return claim.by_theorem1 is not None and claim.lmi_least is not None and claim.by_theorem1 < claim.lmi_least
-
-
-def whole(weights: Weights, modes: Sequence[str]) -> Array:
-    """V, (modes, order, order)."""
-    order = len(weights.V[modes[0]])
-    V = np.zeros((len(modes), order, order))
-    for V_s, mode in zip(V, modes, strict=True):
-        for k, row in enumerate(weights.V[mode]):
-            V_s[k, : k + 1] = V_s[: k + 1, k] = row
-    return V

@@ -36,7 +36,6 @@ from designer.proof.by_vertices import upper_bound
 from designer.proof.certificate import verify
 from designer.proof.cube import Cube
 from designer.proof.least import at_least
-from designer.proof.undercut import whole
 from designer.search.exact_design import certify, design_exact
 from designer.search.lmi_apart import design_apart
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
@@ -307,7 +306,7 @@ def test_what_the_LMI_cannot_undercut_is_proved_of_the_states_as_they_are(driven
     assert coordinates is not None
     weights = undercut(driven).weights
     assert weights is not None
-    V, T = whole(weights, driven.mode_names), weights.states
+    V, T = weights.matrices(driven.mode_names), weights.states
     units = np.diag(1.0 / NaturalUnits(driven, coordinates).state)
     there, here = at_least(coordinates.problem, V, units), at_least(driven, V, T)
     assert there is not None

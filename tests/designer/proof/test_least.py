@@ -22,7 +22,7 @@ from designer.proof import least, silent
 from designer.proof.least import at_least
 from designer.proof.reachable import seen_from
 from designer.proof.silent import at_least_by_silence
-from designer.proof.undercut import least_again, whole
+from designer.proof.undercut import least_again
 from designer.search.starts import node_regression
 from designer.synthesis import design
 from designer.undercut import undercut
@@ -49,7 +49,7 @@ def weights() -> Weights:
 @pytest.fixture(scope="module")
 def V(weights: Weights) -> Array:
     """The same for the states as they are."""
-    V, T = whole(weights, LOSSY.mode_names), np.linalg.inv(weights.states)
+    V, T = weights.matrices(LOSSY.mode_names), np.linalg.inv(weights.states)
     back = np.eye(V.shape[1])
     for at in range(0, V.shape[1] - LOSSY.nw, LOSSY.nx):
         back[at : at + LOSSY.nx, at : at + LOSSY.nx] = T
