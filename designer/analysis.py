@@ -37,6 +37,7 @@ from designer.proof.prover import Prover
 from designer.search.exact_design import SLOW, certify, confirmed, lower_end
 
 _MOST_OF_POLICY = 500, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
+_MOST_SECONDS = 10.0  # for what no gains are below by an LMI
 _SHORT = 1e-3  # a policy that attains less than the exact gain by so much of it is said to
 _NEAR_1 = 1e-4  # rates nearer to 1 are told by what is left to it
 
@@ -247,7 +248,7 @@ def analyse(
 
     `radius`: how large boxes may be for a gamma that is a little larger, of every shape or of those that take little.
     """
-    from designer.lmi.multipliers import least_of_lmi  # loads a solver, which reading gains does not take
+    from designer.undercut import undercut  # loads a solver, which reading gains does not take
 
     refuse_nothing_to_estimate(problem)
     model = model_of_gains(problem, given.K, given.H)
@@ -265,6 +266,7 @@ def analyse(
     if in_box is not None:
         found = in_box.found if math.isfinite(in_box.found) else None
         ladder = ladder._replace(found_in_box=found, proved_in_box=in_box.gamma)
+    by_lmi = undercut(problem, seconds=_MOST_SECONDS)
     policy = worst_policy(model, horizon=_steps_of_policy(model, gain))
     fixed = worst_fixed(model, initial=problem.mode_index(problem.markov.initial))
     return Analysis(
@@ -276,7 +278,8 @@ def analyse(
         ladder=ladder._replace(
             gamma=verdict.gamma if verdict.holds else None,
             lmi="the LMI" if beyond_paper(problem) else "Theorem 2",
-            theorem2_least=least_of_lmi(problem),
+            theorem2_least=by_lmi.gamma,
+            theorem2_why_not=by_lmi.why_not,
         ),
         mode=problem.mode_names[policy.mode],
         steps=len(policy.Gamma) + 1,

@@ -39,6 +39,7 @@ class Ladder(NamedTuple):
     theorem2_least: float | None = None  # proved: no gains have less by Theorem 2
     nominal_exact: float | None = None  # of gains that were designed without the box, where these are others
     nominal_in_box: float | None = None  # gamma of those for every model of the box
+    theorem2_why_not: str | None = None  # why theorem2_least is not there, where it was looked for
 
     @property
     def against_theorem2(self) -> float | None:
@@ -99,6 +100,8 @@ class Ladder(NamedTuple):
         lines = [f"{value:{width}}  {name}" for value, name in texts]
         if self.exact is None and self.gamma is not None:
             lines.append(f"{'-':{width}}  {EXACT}: not computed; analyse does")
+        if self.theorem2_why_not is not None:
+            lines.append(f"{'-':{width}}  what no gains are below by {self.lmi}: not proved; {self.theorem2_why_not}")
         return lines
 
 
@@ -144,7 +147,7 @@ def ladder_of(gains: Gains) -> Ladder:
     theorem1 = proved.theorem1_gamma if proved.holds else None
     rungs = Ladder(proved.floor, proved.exact, gamma, proved.lmi_exact, proved.lmi_gamma, lmi, theorem1)
     box = proved.box if proved.holds else None
-    rungs = rungs._replace(theorem2_least=proved.lmi_least)
+    rungs = rungs._replace(theorem2_least=proved.lmi_least, theorem2_why_not=proved.lmi_why_not)
     return rungs if box is None else rungs._replace(found_in_box=box.found, proved_in_box=box.gamma)
 
 

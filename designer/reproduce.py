@@ -49,9 +49,9 @@ class Computed:
 
     @cached_property
     def least(self) -> float | None:
-        from designer.lmi.multipliers import least_of_lmi
+        from designer.undercut import undercut
 
-        return least_of_lmi(self.problem)
+        return undercut(self.problem).gamma
 
     @cached_property
     def consensus(self) -> float | None:

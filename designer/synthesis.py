@@ -37,6 +37,7 @@ EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate 
 _PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
 _SMALLEST = 1e-40  # and its inverse: products of some such numbers are far from the ends of float64
 SHARE_OF_BOX = 0.5  # of a search's time
+_SHARE_OF_WEIGHTS = 0.002  # of the budget, for what no gains are below by an LMI
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
 
 
@@ -100,7 +101,7 @@ def design(
         gains = min([gains, *([] if ignorant is None else [ignorant])], key=lambda each: each.gamma)
     found = {
         "floor": budget.compared("the floor", lambda: floor_below(problem, gains.certificate.gamma)),
-        "lmi_least": _least_of_lmi(gains, budget),
+        **_of_lmi(gains, budget),
     }
     certificate = gains.certificate.model_copy(update=found)
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
@@ -157,17 +158,18 @@ def from_nominal(
     )
 
 
-def _least_of_lmi(gains: Gains, budget: Budget) -> float | None:
-    """Where an LMI is what the gains come from or what they are compared with."""
+def _of_lmi(gains: Gains, budget: Budget) -> dict[str, Any]:
+    """What no gains have less than by an LMI, where that is what they come from or what they are compared with."""
     if gains.certificate.lmi_gamma is None:
-        return None
+        return {}
+    from designer.undercut import Undercut, undercut  # scipy takes long to import
 
-    def least() -> float | None:
-        from designer.lmi.multipliers import least_of_lmi  # scipy takes long to import
-
-        return least_of_lmi(gains.problem)
-
-    return budget.compared("the least that the LMI can give", least)
+    seconds, offered = _SHARE_OF_WEIGHTS * budget.seconds, gains.certificate.lmi_weights
+    least = budget.compared(
+        "the least that the LMI can give", lambda: undercut(gains.problem, offered=offered, seconds=seconds)
+    )
+    gamma, weights, why_not = least or Undercut(None, why_not="time was up, or a signal came")
+    return {"lmi_least": gamma, "lmi_weights": weights, "lmi_why_not": why_not}
 
 
 def _exact_in_natural_units(

@@ -55,7 +55,7 @@ ROOMS = {
     "designer.model": "designer.coordinates",
     "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model designer.patience",
     "designer.proof": "designer.coordinates designer.decay designer.invariants designer.patience",
-    "designer.lmi": "designer.coordinates designer.gain designer.model designer.patience designer.proof",
+    "designer.lmi": "designer.gain designer.model designer.patience designer.proof",
     "designer.workers": "designer.patience",
     "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
     "designer.patience designer.proof designer.workers",
@@ -66,13 +66,15 @@ ROOMS = {
     "designer.start": "designer.coordinates designer.gain designer.ladder designer.model designer.proof "
     "designer.single_run",
     "designer.beyond_gamma": "designer.gain designer.model designer.start",
+    "designer.undercut": "designer.coordinates designer.lmi designer.model designer.patience designer.proof "
+    "designer.search",
     "designer.box": "designer.coordinates designer.decay designer.gain designer.invariants designer.ladder "
     "designer.model designer.patience designer.proof designer.search",
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
-    "designer.model designer.patience designer.proof designer.search",
+    "designer.model designer.patience designer.proof designer.search designer.undercut",
     "designer.stacked": "designer.model",
     "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
-    "designer.lmi designer.model designer.proof designer.search designer.stacked",
+    "designer.lmi designer.model designer.proof designer.search designer.stacked designer.undercut",
     "designer.ranking": "designer.analysis designer.box designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.conformity": "designer.model designer.problems designer.search",
@@ -80,7 +82,7 @@ ROOMS = {
     "designer.synthesis designer.workers",
     "designer.sweep": "designer.ladder designer.problems designer.search designer.synthesis designer.workers",
     "designer.reproduce": "designer.gain designer.ladder designer.lmi designer.model designer.problems designer.search "
-    "designer.synthesis",
+    "designer.synthesis designer.undercut",
     "designer.simulation": "designer.gain designer.model designer.start designer.workers",
     "designer.ledger": "designer.coordinates designer.gain designer.model designer.proof",
     "designer.chance": "designer.single_run designer.start",

@@ -25,7 +25,7 @@ from agent.contract import messages
 from agent.contract.arrays import Array, Matrix, Model, Number
 from agent.contract.errors import InputError
 from agent.contract.frozen import Frozen
-from agent.contract.gains import BoxClaim, Gains
+from agent.contract.gains import BoxClaim, Gains, Weights
 from agent.contract.problem import Problem
 from agent.contract.problem.disturbance import DampedSine, Impulse, Quiet, Samples, White, WorstCase
 from agent.contract.problem.parts import Continuous
@@ -100,6 +100,7 @@ def examples() -> dict[type, Frozen]:
         Samples(kind="csv", file="w.csv", values=np.ones((2, 1))),
         WorstCase(kind="worst-case"),
         Quiet(),
+        Weights(states=np.eye(1), V={"1": [[1.0], [0.0, 1.0]]}),
         BoxClaim(gamma=1.0, ends=[True], rows=[0], signs=[]),
         OfPlant(A=[[0.1, "2%"]]),
         OfNode(C="1%", arrival_probability=[0.1, 0]),

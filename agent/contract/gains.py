@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from agent.contract.arrays import Array, Matrix, Model, Number, shape_text
+from agent.contract.arrays import Array, Matrix, Model, Number, Vector, shape_text
 from agent.contract.errors import InputError, listed
 from agent.contract.files import RepeatedKey, kind_of, read_bytes, read_json, write_whole
 from agent.contract.problem import Problem
@@ -53,6 +54,32 @@ class BoxClaim(Model):
     rounds: tuple[tuple[Gamma, Share], ...] = Field(default=(), max_length=100)
 
 
+class Weights(Model):
+    """What proves `lmi_least`: V(s) >= 0 on [T x; T e_1; ...; T e_n; w], or without x where P is over e alone.
+
+    Of V(s) the rows of the lower triangle. Where nothing looks at an entry it may be 0, and stands for any other.
+    `designer.proof.least` proves from them whatever they prove, and believes none of it.
+    """
+
+    states: Matrix  # T, (r, nx): r of them are what w brings about
+    V: dict[str, tuple[Vector, ...]]
+
+    @classmethod
+    def of(cls, states: Array, V: Array, modes: Sequence[str]) -> Self:
+        """V (modes, order, order), symmetric."""
+        rows = {mode: tuple(row[: k + 1] for k, row in enumerate(V_s)) for mode, V_s in zip(modes, V, strict=True)}
+        return cls(states=states, V=rows)
+
+    def matrices(self, modes: Sequence[str]) -> Array:
+        """V again."""
+        order = len(self.V[modes[0]])
+        V = np.zeros((len(modes), order, order))
+        for V_s, mode in zip(V, modes, strict=True):
+            for k, row in enumerate(self.V[mode]):
+                V_s[k, : k + 1] = V_s[: k + 1, k] = row
+        return V
+
+
 class Certificate(Model):
     """What is proved: sup_k E ||z_tilde(k)||^2 <= gamma^2 sum_k ||w(k)||^2, from zero initial error.
 
@@ -72,6 +99,8 @@ class Certificate(Model):
     horizon: int | None = Field(default=None, strict=True)  # kind "exact": the proof needs no more steps than this
     lmi_gamma: Number | None = None  # where an LMI was solved: its optimum, as the solver gave it
     lmi_least: Number | None = None  # proved: no gains have less by an LMI of this form
+    lmi_weights: Weights | None = None  # which prove it; None: nothing does, or a disturbance that no node sees
+    lmi_why_not: str | None = None  # why there is no lmi_least beside an lmi_gamma
     lmi_exact: tuple[Number, Number] | None = None  # the gain of the LMI's gains, where those are not these
     exact: tuple[Number, Number] | None = None  # the gain lies between these
     floor: Number | None = None
@@ -226,6 +255,27 @@ class Gains(Model):
     @model_validator(mode="after")
     def _check_links(self) -> Self:
         check_links(self.problem, self.K, self.H)
+        return self
+
+    @model_validator(mode="after")
+    def _check_weights(self) -> Self:
+        weights, problem = self.certificate.lmi_weights, self.problem
+        if weights is None:
+            return self
+        states, order = len(weights.states), len(weights.states) * (problem.n + bool(problem.plant_states)) + problem.nw
+        if weights.states.shape[1] != problem.nx or states > problem.nx:
+            raise ValueError(
+                f"certificate: lmi_weights: states is {shape_text(weights.states)}; it must have {problem.nx} columns, "
+                "and no more rows than that"
+            )
+        _same_names("certificate: lmi_weights: V", weights.V, problem.mode_names, "modes")
+        for mode, rows in weights.V.items():
+            lengths = [len(row) for row in rows]
+            if lengths != list(range(1, order + 1)):
+                raise ValueError(
+                    f'certificate: lmi_weights: V of mode "{mode}" is no lower triangle of {order} rows, the '
+                    "first of 1 number and each of one more than the one above it"
+                )
         return self
 
     @model_validator(mode="after")

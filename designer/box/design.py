@@ -36,6 +36,7 @@ from designer.search.barrier import Barrier
 from designer.search.descent import Progress, longest_horizon
 from designer.search.exact_design import certify, certify_at_once
 
+_OF_THE_PROBLEM = ("floor", "lmi_gamma", "lmi_exact", "lmi_least", "lmi_weights", "lmi_why_not")
 _WEIGHTS = (9e-3, 3e-3, 9e-4, 3e-4, 9e-5, 3e-5)  # mu
 _ROUNDS = 3  # for each mu: models that join
 _MOST_MODELS = 12
@@ -127,7 +128,7 @@ def design_for_box(
         )
     except Unattainable:
         return ForBox(nominal, before, nominal, before, f"what was found has no certificate; {searched}")
-    known = {name: getattr(nominal.certificate, name) for name in ("floor", "lmi_gamma", "lmi_exact", "lmi_least")}
+    known = {name: getattr(nominal.certificate, name) for name in _OF_THE_PROBLEM}
     status, steps = f"{nominal.solver.status}; for {box.extent}: {searched}", nominal.solver.iterations + descent.steps
     spent = time.perf_counter() - started
     update = {

@@ -16,11 +16,13 @@ from designer.commands.within import add_within, asked
 if TYPE_CHECKING:
     from agent.contract.gains import Gains
     from agent.contract.problem import Problem
+    from designer.proof.undercut import LeastAgain
 
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
     "exact": "mean-square stability by (17), and gamma by the recursion of the exact gain",
 }
+_ANSWERS = {True: "proved", False: "false", None: "open"}
 _BESIDE = {"name", "disturbance", "tolerance", "initial", "initial_error"}  # what a proof of gamma does not depend on
 
 
@@ -45,7 +47,7 @@ def verify_command(options: argparse.Namespace) -> int:
     from designer.problems import find
     from designer.proof.certificate import verify
     from designer.proof.prover import BALLS, FLOATS
-    from designer.proof.silent import least_again
+    from designer.proof.undercut import least_again
 
     if options.settings and options.problem is None:
         raise InputError(f"--set {options.settings[0]} is for PROBLEM; name the problem that the gains have to be for")
@@ -62,8 +64,8 @@ def verify_command(options: argparse.Namespace) -> int:
         least = least_again(gains) if verdict.holds else None
     except InputError as error:
         raise InputError(f"{options.gains}: {error}") from None
-    if least is False:
-        why = f"no gains may have less by the LMI than {gains.certificate.lmi_least}, it claims, and its own have less"
+    if least is not None and least.holds is False:
+        why = f"no gains have less by an LMI than {gains.certificate.lmi_least}, it says, but {least.how}"
         verdict = verdict._replace(holds=False, failure=why)
     asked_for = bool(options.within) or "tolerance" in differs
     good = EXIT_GOOD if verdict.holds and not (asked_for and in_box and in_box.gamma is None) else EXIT_NO
@@ -73,13 +75,11 @@ def verify_command(options: argparse.Namespace) -> int:
     proved = [PROVED[claim.kind]]
     if claim.theorem1_gamma is not None:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
-    if least:
-        proved.append(
-            f"no gains have less than {claim.lmi_least} by an LMI of this form: no node sees some disturbance"
-        )
+    if least is not None and least.holds:
+        proved.append(f"no gains have less than {claim.lmi_least} by an LMI of this form: {least.how}")
     if options.json:
         said: dict[str, object] = {"kind": claim.kind, "theorem1_gamma": claim.theorem1_gamma, "seconds": seconds}
-        said["lmi_least_proved"] = least is True
+        said["lmi_least"] = None if least is None else _ANSWERS[least.holds]
         said["within"] = None if in_box is None else in_box.document()
         of = _of_problem(gains, options.gains)
         print(json.dumps(verdict._asdict() | said | of | {"claimed": _claimed(gains, verdict.low, least)}))
@@ -96,6 +96,8 @@ def verify_command(options: argparse.Namespace) -> int:
         if verdict.interval_is_false:
             false = f"{options.gains} says what is proved false: {verdict.failure}"
             no = f"{false}; gamma = {verdict.gamma} itself is proved"
+        if least is not None and least.holds is False:
+            no = f"{options.gains} claims too much: {verdict.failure}; gamma = {verdict.gamma} itself is proved"
         lines = [f"does not hold: {no}", *lines]
     print("\n".join([*lines, f"in      {how}"]))
     return good
@@ -164,13 +166,13 @@ def _whose(gains: Gains, differs: list[str]) -> list[str]:
     return lines
 
 
-def _claimed(gains: Gains, low: float | None, least: bool | None) -> list[str]:
+def _claimed(gains: Gains, low: float | None, least: LeastAgain | None) -> list[str]:
     """What stands in the file too, and is not proved here."""
     beside = ("floor", "lmi_gamma", "lmi_exact", *(("exact",) if low is None else ()))
     there = [name for name in beside if getattr(gains.certificate, name) is not None]
     found = [f"{listed(there)}: computed by whoever designed the gains"] if there else []
-    if gains.certificate.lmi_least is not None and not least:
-        found.append(f"lmi_least = {gains.certificate.lmi_least}: not proved here, but when they were designed")
+    if least is not None and least.holds is None:
+        found.append(f"lmi_least = {gains.certificate.lmi_least}: not proved here; {least.how}")
     if gains.worst_case is not None:
         found.append("worst_case: a w of energy 1; that no other fixed w does worse is not proved")
     return found

@@ -18,6 +18,7 @@ class LmiSolution(NamedTuple):
     X: Array  # (modes, n nx, sum ny): X^s = Q_bar(s) H_bar^s
     Y: Array  # (modes, n nx, n nx): Y^s = Q_bar(s) K_bar^s
     solver: Solver
+    weights: Array | None = None  # (modes, n_eta + nw, n_eta + nw): multipliers of the balance, over [x; e; w]
 
 
 def beyond_paper(problem: Problem) -> str | None:

@@ -31,18 +31,6 @@ class Cones(NamedTuple):
         first, order = sum(sizes[:number]), self.orders[number]
         return _matrix(z[first : first + sizes[number]], order)
 
-    def without(self, dropped: dict[int, Indices]) -> Cones:
-        """With rows and columns left out of the inequalities of these numbers."""
-        kept, orders = [], []
-        for number, order in enumerate(self.orders):
-            left = np.ones(order, dtype=bool)
-            left[dropped.get(number, [])] = False
-            columns, rows = np.tril_indices(order)
-            kept.append(left[rows] & left[columns])
-            orders.append(int(left.sum()))
-        at = np.concatenate(kept)
-        return Cones(scipy.sparse.csc_matrix(self.A.tocsr()[at]), self.b[at], orders)
-
 
 class Assembly:
     """Hands out unknowns and inequalities; `cones` puts the inequalities together."""

@@ -42,6 +42,7 @@ from designer.model.error_model import measurement_slices
 from designer.model.units import Units, natural_units, rescaled
 
 Link = tuple[int, int]  # (i, j): node i hears node j
+MOST_WEIGHTS = 20_000  # multipliers that are kept: a file that has them has other things in it
 MARGIN = 1e-6  # of the balance, for unstable plants: designer.lmi.inwards knows no way inwards there
 
 
@@ -146,15 +147,19 @@ def _run(
     lmi = assemble(rescaled(problem, units), margin=margin, error=units.error)
     q = np.zeros(lmi.cones.A.shape[1])
     q[lmi.delta] = 1.0
-    u, record, _ = solver(lmi.cones, q)
-    return record, _solution(problem, lmi, u, units, record) if record.status in SOLVED else None
+    u, record, z = solver(lmi.cones, q)
+    if record.status not in SOLVED:
+        return record, None
+    solution = _solution(problem, lmi, u, units, record)
+    if z is not None and numbers_of_weights(problem) <= MOST_WEIGHTS:
+        solution = solution._replace(weights=multipliers(problem, lmi, z, units))
+    return record, solution
 
 
-def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0, split: bool = True) -> Lmi:
+def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0) -> Lmi:
     """Unknowns and inequalities of every mode; `margin` times diag{R, I, Q(s)} is kept to spare in the balance.
 
-    Without `split` the balance is one piece. Errors are measured in units `error` times as large as the state's: what
-    x and w do to them is divided by it.
+    Errors are measured in units `error` times as large as the state's: what x and w do to them is divided by it.
     """
     build, nx, n, columns = Assembly(), problem.nx, problem.n, split_columns(problem)
     delta, R = build.unknown(1, 1), build.symmetric(problem.plant_states)
@@ -169,8 +174,7 @@ def assemble(problem: Problem, *, margin: float = 0.0, error: float = 1.0, split
         links = [(i, j) for i in range(n) for j in heard[i]]
         X = {(i, j): build.unknown(nx, len(problem.nodes[j].C)) for i, j in links}
         Y = {(i, j): build.unknown(nx, nx) for i, j in links if i != j or not problem.unbiased}
-        groups = heard if split else [tuple(range(n))]
-        balance = _balance(build, problem, columns, R, Q[s], groups, 1.0 - margin)
+        balance = _balance(build, problem, columns, R, Q[s], heard, 1.0 - margin)
         home = [_home(balance, heard_i) for heard_i in heard]
         spared = {k: max((i for i in range(n) if home[i] == k), key=lambda i: len(heard[i])) for k in set(home)}
         mode = Mode(Q[s], X, Y, T={}, U={}, balance=balance, nodes=[], losses={}, links={}, peaks=[])
@@ -334,6 +338,33 @@ def _peak(build: Assembly, problem: Problem, i: int, Q: Indices, delta: Indices)
     for k in range(problem.nz):
         matrix.add(z[k : k + 1], z[k : k + 1], delta)
     return matrix
+
+
+def numbers_of_weights(problem: Problem) -> int:
+    """How many `multipliers` has."""
+    order = problem.plant_states + problem.n * problem.nx + problem.nw
+    return len(problem.topologies) * order * (order + 1) // 2
+
+
+def multipliers(problem: Problem, lmi: Lmi, z: Array, units: Units) -> Array:
+    """Those of the balance, (modes, n_eta + nw, n_eta + nw), over [x; e; w]; 0 where no piece has two of them.
+
+    Pieces agree where they meet, but for the solver's tolerance: the mean is taken.
+    """
+    nx, p, at_w = problem.nx, problem.plant_states, problem.plant_states + problem.n * problem.nx
+    V = np.zeros((len(lmi.modes), at_w + problem.nw, at_w + problem.nw))
+    for s, mode in enumerate(lmi.modes):
+        pieces = np.zeros_like(V[s])
+        for piece in mode.balance:
+            at = np.concatenate([np.arange(p), at_w + lmi.columns.shared])
+            for j in (v - 1 for v in piece.at if v):
+                at = np.concatenate([at, p + j * nx + np.arange(nx), at_w + lmi.columns.own[j]])
+            rows = piece.rows(tuple(piece.at))
+            V[s][np.ix_(at, at)] += lmi.cones.piece(z, piece.matrix.number)[np.ix_(rows, rows)]
+            pieces[np.ix_(at, at)] += 1.0
+        V[s] /= np.maximum(pieces, 1.0)
+    own = [np.tile(units.state, p // nx), np.tile(units.error * units.state, problem.n), np.ones(problem.nw)]
+    return V * (sizes := np.concatenate(own)) * sizes[:, None]
 
 
 def _solution(problem: Problem, lmi: Lmi, u: Array, units: Units, record: Solver) -> LmiSolution:

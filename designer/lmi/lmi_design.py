@@ -10,7 +10,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from agent.contract.errors import Unattainable
-from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
+from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver, Weights
 from agent.contract.problem import Problem
 from designer.lmi import LmiSolution
 from designer.lmi.attempts import tried_further
@@ -52,7 +52,7 @@ def design_by_lmi(problem: Problem, method: str, budget: Budget | None = None) -
         K,
         H,
         method=method,
-        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma),
+        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma, weights=_weights(problem, solution)),
         solver=solution.solver,
         solve=ended - started - certify,
         certify=certify,
@@ -181,7 +181,15 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
     return None
 
 
-def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float | None) -> Certificate:
+def _weights(problem: Problem, solution: LmiSolution) -> Weights | None:
+    """The multipliers, which prove nothing yet: designer.undercut makes of them what does, if anything can be made."""
+    V = solution.weights
+    return None if V is None else Weights.of(np.eye(problem.nx), V, problem.mode_names)
+
+
+def _certificate(
+    problem: Problem, confirmed: Confirmed, *, lmi_gamma: float | None, weights: Weights | None = None
+) -> Certificate:
     P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.plant_states
     modes, nodes = problem.mode_names, problem.node_names
     structured = confirmed.form == "structured"
@@ -199,6 +207,7 @@ def _certificate(problem: Problem, confirmed: Confirmed, *, lmi_gamma: float | N
         else None,
         P=None if structured else dict(zip(modes, P, strict=True)),
         lmi_gamma=lmi_gamma,
+        lmi_weights=weights,
         holds=verdict.holds,
         verified=f"(17) and (18) of Theorem 1 in every mode, for the numbers stored here: {verdict.arithmetic}",
         margins=verdict.margins,

@@ -18,7 +18,6 @@ from collections.abc import Iterator
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx
 
-from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.proof.ball_model import told
 from designer.proof.balls import exact
@@ -32,21 +31,6 @@ def at_least_by_silence(problem: Problem) -> float | None:
     with ctx.workprec(_BITS):
         found = [float_below(bound) for bound in _bounds(problem)]
     return max((bound for bound in found if bound is not None), default=None)
-
-
-def least_again(gains: Gains) -> bool | None:
-    """Whether no gains have less by the LMI than a file claims: proved without weights, refuted by its own P, or None.
-
-    P = diag{R, Q(s)} for which `gains` have less by Theorem 1 refutes it: that P has to be proved before.
-    """
-    claim = gains.certificate
-    if claim.lmi_least is None:
-        return None
-    own = claim.gamma if claim.kind == "lyapunov" else claim.theorem1_gamma
-    if claim.form == "structured" and own is not None and own < claim.lmi_least:
-        return False
-    proved = at_least_by_silence(gains.problem)
-    return True if proved is not None and proved >= claim.lmi_least else None
 
 
 def _bounds(problem: Problem) -> Iterator[arb]:

@@ -126,10 +126,11 @@ class Account:
     @cached_property
     def rungs(self) -> list[tuple[str, float]]:
         """The ladder of the gains, of the LMI what is proved here, and what this run came to beside it."""
-        from designer.proof.silent import least_again  # which needs balls
+        from designer.proof.undercut import least_again  # which needs balls
 
         verdict, ladder = self.verdict, ladder_of(self.log.gains)
-        rungs = (ladder if least_again(self.log.gains) else ladder._replace(theorem2_least=None)).rungs()
+        least = least_again(self.log.gains)
+        rungs = (ladder if least is not None and least.holds else ladder._replace(theorem2_least=None)).rungs()
         if verdict.peak and verdict.energy and self.log.has_plant:
             rungs.append((THIS_RUN, verdict.peak.size / verdict.energy**0.5))
         return rungs

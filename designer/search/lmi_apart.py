@@ -76,6 +76,7 @@ def _brought_back(certificate: Certificate, T: Array, unit: float) -> Certificat
         return np.asarray((found + found.T) / 2.0)
 
     R, Q, P, lmi_gamma = certificate.R, certificate.Q, certificate.P, certificate.lmi_gamma
+    weights = certificate.lmi_weights
     return certificate.model_copy(
         update={
             "R": None if R is None else back(R),
@@ -83,6 +84,7 @@ def _brought_back(certificate: Certificate, T: Array, unit: float) -> Certificat
             "P": P and {mode: back(P_s) for mode, P_s in P.items()},
             "gamma": unit * certificate.gamma,
             "lmi_gamma": None if lmi_gamma is None else unit * lmi_gamma,
+            "lmi_weights": weights and weights.model_copy(update={"states": weights.states @ T}),
         }
     )
 

@@ -134,12 +134,10 @@ def least_variance_gains(problem: Problem, held: NDArray[np.bool_] | None = None
 
     `held`: as `Entries` takes it.
     """
-    modes, entries, pattern = len(problem.topologies), Entries(problem, held), Inputs(problem).pattern
-    batches = _batches(problem, entries)
+    modes, greedy = len(problem.topologies), Greedy(problem, held)
     chain = (1.0 - _RESTARTS) * problem.markov.transition + _RESTARTS / modes
     chain /= chain.sum(axis=1, keepdims=True)
     occupied = np.linalg.matrix_power((chain + np.eye(modes)) / 2.0, 2**20).mean(axis=0)
-    v = np.zeros(len(entries.units))
     size = problem.plant_states + problem.n * problem.nx
     fresh = _STIRRED * float((problem.plant.B**2).sum()) * occupied[:, None, None] * np.eye(size)
     X = fresh
@@ -148,10 +146,8 @@ def least_variance_gains(problem: Problem, held: NDArray[np.bool_] | None = None
     for _ in range(_STEPS_OF_NETWORK):
         look()
         joint[:, :size, :size] = X
-        for batch in batches:
-            v[batch.at] = batch.best(joint)
-        K_bar, H_bar = entries.unpack(entries.in_units(v))
-        operator = Operator(error_model(problem, K_bar, H_bar), pattern)
+        K_bar, H_bar = greedy.gains(joint)
+        operator = greedy.operator(K_bar, H_bar)
         operator.transition = chain
         X_next = operator.carry(joint) + fresh
         change = np.abs(X_next - X).max()
@@ -159,6 +155,24 @@ def least_variance_gains(problem: Problem, held: NDArray[np.bool_] | None = None
         if change <= _SETTLED_NETWORK * np.abs(X).max() or np.abs(X).max() > _BOUNDLESS:
             break
     return K_bar, H_bar
+
+
+class Greedy:
+    """Gains that leave every node the least mean square of its next error, whatever the moments of [eta; w] are."""
+
+    def __init__(self, problem: Problem, held: NDArray[np.bool_] | None = None) -> None:
+        self.problem, self._entries, self._pattern = problem, Entries(problem, held), Inputs(problem).pattern
+        self._batches = _batches(problem, self._entries)
+
+    def gains(self, joint: Array) -> StackedGains:
+        """`joint`: the moments of each mode, (modes, n_eta + nw, n_eta + nw)."""
+        v = np.zeros(len(self._entries.units))
+        for batch in self._batches:
+            v[batch.at] = batch.best(joint)
+        return self._entries.unpack(self._entries.in_units(v))
+
+    def operator(self, K_bar: Array, H_bar: Array) -> Operator:
+        return Operator(error_model(self.problem, K_bar, H_bar), self._pattern)
 
 
 class _Batch(NamedTuple):

@@ -26,7 +26,6 @@ from designer.gain.noise import long_run, steady_state
 from designer.gain.worst_case import worst_fixed
 from designer.ledger.deviation import Deviation
 from designer.ledger.exact import Ledger
-from designer.lmi.multipliers import least_of_lmi, multipliers
 from designer.model.error_model import error_model, link_gains, model_of_gains, stacked_links
 from designer.model.units import NaturalUnits
 from designer.proof.ball_model import BallModel
@@ -41,6 +40,7 @@ from designer.search.exact_design import certify, design_exact
 from designer.search.lmi_apart import design_apart
 from designer.search.starts import consensus_gains, ignoring, least_variance_gains
 from designer.start import from_start
+from designer.undercut import undercut
 
 KINDS: dict[str, dict[str, Any]] = {
     "hidden losses": {},
@@ -304,22 +304,25 @@ def test_what_the_LMI_cannot_undercut_is_proved_of_the_states_as_they_are(driven
     """Weights on [T x; T e; w] prove the same of both; too much weight on w proves less, and none that is not >= 0."""
     coordinates = Coordinates.of(driven)
     assert coordinates is not None
-    V = next(multipliers(coordinates.problem))
-    there, here = at_least(coordinates.problem, V), at_least(driven, V, coordinates.T)
+    weights = undercut(driven).weights
+    assert weights is not None
+    V, T = weights.matrices(driven.mode_names), weights.states
+    units = np.diag(1.0 / NaturalUnits(driven, coordinates).state)
+    there, here = at_least(coordinates.problem, V, units), at_least(driven, V, T)
     assert there is not None
     assert here == pytest.approx(there, rel=1e-9)
     assert at_least(driven, V) is None, "which are no weights on [x; e; w]"
     V[0, -1, -1] *= 1.01
-    less = at_least(driven, V, coordinates.T)
+    less = at_least(driven, V, T)
     assert less is not None
     assert less < there
     V[0, -1, -1] *= -1.0
-    assert at_least(driven, V, coordinates.T) is None
+    assert at_least(driven, V, T) is None
 
 
 def test_gains_of_the_LMI_come_near_its_optimum(driven: Problem) -> None:
     """Which lies between what is proved from below and what the solver says, not a thousandfold above."""
-    gains, least = design_apart(driven, "decomposed"), least_of_lmi(driven)
+    gains, least = design_apart(driven, "decomposed"), undercut(driven).gamma
     assert gains is not None
     assert least is not None
     assert gains.certificate.lmi_gamma == pytest.approx(least, rel=1e-3)

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import pytest
 
 from agent.contract.gains import Gains
-from designer import beyond_gamma, synthesis
+from designer import beyond_gamma, synthesis, undercut
 from designer.box import design as box_design
 from designer.cli import main
 from designer.commands import design as command
 from designer.commands.stopping import HURRYING, NOTHING, STOPPED, STOPPING
-from designer.lmi import conic, lmi_design, multipliers
+from designer.lmi import conic, lmi_design
 from designer.patience import Budget
 from designer.proof.certificate import verify
 from designer.search import descent, exact_design, quiet
@@ -66,7 +66,7 @@ PHASES = [
     Phase(COMPARISON, synthesis, "floor_below", (), "the floor"),
     Phase(COMPARISON, beyond_gamma, "node_gains", (), "noise, and the gains of single nodes"),
     Phase(COMPARISON, synthesis, "_with_gain", DECOMPOSED, "the exact gain of these gains"),
-    Phase(COMPARISON, multipliers, "least_of_lmi", DECOMPOSED, "the least that the LMI can give"),
+    Phase(COMPARISON, undercut, "undercut", DECOMPOSED, "the least that the LMI can give"),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +11,21 @@ from networks import random_gains, random_problem, real_network
 from places import ROOT
 
 from agent.contract.arrays import Array
-from agent.contract.gains import Gains
+from agent.contract.errors import InputError
+from agent.contract.gains import Gains, Weights
 from agent.contract.problem import Problem
 from designer.cli import main
 from designer.gain.exact import Operator
-from designer.lmi import multipliers
-from designer.lmi.multipliers import least_of_lmi
 from designer.model.error_model import error_model
 from designer.problems import find
 from designer.proof import least, silent
 from designer.proof.least import at_least
-from designer.proof.silent import at_least_by_silence, least_again
+from designer.proof.reachable import seen_from
+from designer.proof.silent import at_least_by_silence
+from designer.proof.undercut import least_again
 from designer.search.starts import node_regression
 from designer.synthesis import design
+from designer.undercut import undercut
 
 LOSSY = find("zhu2020-lossy")
 PROBLEMS = {
@@ -36,15 +39,27 @@ problems = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=PROBLEMS)
 
 
 @pytest.fixture(scope="module")
-def V() -> Array:
-    """Weights that prove a bound of the paper's second example."""
-    return next(V for V in multipliers.multipliers(LOSSY) if at_least(LOSSY, V) is not None)
+def weights() -> Weights:
+    """Those that prove a bound of the paper's second example."""
+    found = undercut(LOSSY).weights
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def V(weights: Weights) -> Array:
+    """The same for the states as they are."""
+    V, T = weights.matrices(LOSSY.mode_names), np.linalg.inv(weights.states)
+    back = np.eye(V.shape[1])
+    for at in range(0, V.shape[1] - LOSSY.nw, LOSSY.nx):
+        back[at : at + LOSSY.nx, at : at + LOSSY.nx] = T
+    return np.asarray(back @ V @ back.T)
 
 
 @problems
 def test_the_optimum_is_enclosed(problem: Problem) -> None:
     """Between what is proved from below and what Theorem 1 certifies of a design there is a thousandth at most."""
-    low, certified = least_of_lmi(problem), design(problem, method="decomposed").certificate.by_theorem1
+    low, certified = undercut(problem).gamma, design(problem, method="decomposed").certificate.by_theorem1
     assert low is not None
     assert certified is not None
     assert low <= certified <= low * (1.0 + 1e-3)
@@ -53,7 +68,7 @@ def test_the_optimum_is_enclosed(problem: Problem) -> None:
 def test_the_printed_gamma_of_the_first_example_is_below_all_that_the_theorem_gives() -> None:
     """Its best weights lie on a line that no floats meet; the disturbance that nobody sees stands on it."""
     problem = find("zhu2020-ideal")
-    low, certified = least_of_lmi(problem), design(problem, method="decomposed").certificate.by_theorem1
+    low, certified = undercut(problem).gamma, design(problem, method="decomposed").certificate.by_theorem1
     assert low is not None
     assert certified is not None
     assert 0.23 < low <= certified <= low * (1.0 + 1e-3)
@@ -82,7 +97,7 @@ def test_no_gains_leave_less_of_a_regression(problem: Problem) -> None:
 def residual(problem: Problem, s: int, i: int, moments: Array) -> Array:
     with least.ctx.workprec(256):
         (V,) = least.symmetric(moments[None])
-        Res = least._residual(least.regression(problem, s, i), V, np.arange(len(moments)))
+        Res = least._residual(least.regression(problem, s, i, seen_from(problem)), V, np.ones(len(moments), dtype=bool))
         return np.array([float(entry.mid()) for entry in Res.entries()]).reshape(problem.nx, problem.nx)
 
 
@@ -175,30 +190,59 @@ def test_eigenvalues_that_balls_do_not_tell_apart_prove_nothing() -> None:
         assert list(silent._real_pairs(silent.exact(np.array(rows)))) == []
 
 
-def claiming(name: str, least: float) -> Gains:
+def claiming(name: str, least: float, weights: Weights | None = None) -> Gains:
     """Gains of the LMI, of a problem of the paper, whose file claims that."""
     gains = Gains.load(ROOT / "recordings" / "golden" / f"{name}.gains.json")
-    return gains.model_copy(update={"certificate": gains.certificate.model_copy(update={"lmi_least": least})})
+    claim = {"lmi_least": least, "lmi_weights": weights}
+    return gains.model_copy(update={"certificate": gains.certificate.model_copy(update=claim)})
+
+
+def holds(gains: Gains) -> bool | None:
+    found = least_again(gains)
+    assert found is not None
+    return found.holds
 
 
 def test_what_a_file_claims_of_the_lmi_is_proved_again_refuted_or_left_open() -> None:
-    """By the silent disturbance, by the P in the file, and between both not at all."""
+    """By the silent disturbance, by the P in the file, and between both, without weights, not at all."""
     found = at_least_by_silence(find("zhu2020-ideal"))
     assert found is not None
-    assert least_again(claiming("zhu2020-ideal", found)) is True
-    assert least_again(claiming("zhu2020-ideal", float(np.nextafter(found, 1.0)))) is None
+    assert holds(claiming("zhu2020-ideal", found)) is True
+    assert holds(claiming("zhu2020-ideal", float(np.nextafter(found, 1.0)))) is None
     own = claiming("zhu2020-ideal", 0.1).certificate.gamma
-    assert least_again(claiming("zhu2020-ideal", own)) is None
-    assert least_again(claiming("zhu2020-ideal", float(np.nextafter(own, 1.0)))) is False
-    assert least_again(claiming("zhu2020-lossy", 0.3479)) is None
+    assert holds(claiming("zhu2020-ideal", own)) is None
+    assert holds(claiming("zhu2020-ideal", float(np.nextafter(own, 1.0)))) is False
+    assert holds(claiming("zhu2020-lossy", 0.3479)) is None
+    assert least_again(Gains.load(ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json")) is None
+
+
+def test_the_weights_of_a_file_prove_what_it_claims_and_no_more(weights: Weights) -> None:
+    """Not a part in a million more; and other weights, or these for another problem, prove it no longer."""
+    least, far = undercut(LOSSY).gamma, 1.0 + 1e-6
+    assert least is not None
+    assert holds(claiming("zhu2020-lossy", least, weights)) is True
+    assert holds(claiming("zhu2020-lossy", least * far, weights)) is False
+    assert holds(claiming("zhu2020-ideal", least, weights)) is False, "which has the same shape"
+    document = LOSSY.document()
+    document["node"][0]["arrival_probability"] = 0.9
+    other = undercut(Problem.from_document(document)).weights
+    for wrong in (other, stretched(weights, 0, 0), stretched(weights, -1, -1), stretched(weights, 3, 2)):
+        assert holds(claiming("zhu2020-lossy", least, wrong)) is False
+
+
+def stretched(weights: Weights, row: int, column: int) -> Weights:
+    """One number of one mode, a part in ten thousand larger."""
+    rows = [numbers.copy() for numbers in weights.V["2"]]
+    rows[row][column] *= 1.0 + 1e-4
+    return weights.model_copy(update={"V": {**weights.V, "2": tuple(rows)}})
 
 
 @pytest.mark.parametrize(
     ("least", "code", "says"),
     [
-        (0.3297, 0, "proved  no gains have less than 0.3297 by"),
-        (0.3297735, 1, "its own have less"),
-        (0.329773, 0, "claimed lmi_least = 0.329773: not proved here"),
+        (0.3297, 0, "proved  no gains have less than 0.3297 by an LMI of this form: no node sees some disturbance"),
+        (0.3297735, 1, "claims too much: no gains have less by an LMI than 0.3297735, it says, but its own have less"),
+        (0.329773, 0, "claimed lmi_least = 0.329773: not proved here; no weights are stored"),
     ],
 )
 def test_verify_says_which(
@@ -208,3 +252,53 @@ def test_verify_says_which(
     path.write_bytes(claiming("zhu2020-ideal", least).canonical())
     assert main(["verify", str(path)]) == code
     assert says in capsys.readouterr().out
+
+
+def test_verify_proves_by_the_weights_of_a_file(
+    weights: Weights, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, least = tmp_path / "gains.json", undercut(LOSSY).gamma
+    assert least is not None
+    path.write_bytes(claiming("zhu2020-lossy", least, weights).canonical())
+    assert main(["verify", str(path)]) == 0
+    assert f"proved  no gains have less than {least} by an LMI of this form: by the weights" in capsys.readouterr().out
+    assert main(["verify", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["lmi_least"] == "proved"
+    path.write_bytes(claiming("zhu2020-lossy", least * (1.0 + 1e-6), weights).canonical())
+    assert main(["verify", str(path)]) == 1
+    assert f"but its weights show no more than {least}; gamma = 0.347" in capsys.readouterr().out
+
+
+def test_weights_that_are_none_are_refused_as_a_file_is_read(weights: Weights) -> None:
+    """A mode too many, a row too long, states that are not those of the problem."""
+    short = {mode: rows[:-1] for mode, rows in weights.V.items()}
+    for wrong, why in (
+        ({"V": {**weights.V, "9": weights.V["1"]}}, "modes are"),
+        ({"V": short}, "no lower triangle of 11 rows"),
+        ({"states": np.eye(3)}, "must have 2 columns"),
+    ):
+        with pytest.raises(InputError, match=why):
+            claiming("zhu2020-lossy", 0.3, weights.model_copy(update=wrong))
+
+
+# what is not looked at, and what w never moves
+def test_entries_that_nothing_looks_at_may_be_anything() -> None:
+    """Of a line of nodes two far ones never meet; what is 0 there is no number, and what somebody looks at is."""
+    chain = np.eye(4, dtype=bool) | np.eye(4, k=1, dtype=bool) | np.eye(4, k=-1, dtype=bool)
+    everything = np.ones(4, dtype=bool)
+    assert sorted(map(sorted, least.cliques(chain, everything))) == [[0, 1], [1, 2], [2, 3]]
+    ring = chain.copy()
+    ring[0, 3] = ring[3, 0] = True
+    assert list(least.cliques(ring, everything)) == [[0, 1, 2, 3]], "a ring cannot always be completed"
+
+
+def test_states_that_w_never_moves_change_nothing() -> None:
+    """One more state, which is measured and is part of z, but moves by itself: it stays 0, and so does its error."""
+    document = LOSSY.document()
+    plant = document["plant"]
+    plant["A"] = [[*row, 0.3] for row in plant["A"]] + [[0.0, 0.0, 0.9]]
+    plant["B"], plant["M"] = [*plant["B"], [0.0]], [[*row, 5.0] for row in plant["M"]]
+    for node in document["node"]:
+        node["C"] = [[*row, 1.0] for row in node["C"]]
+    still = Problem.from_document(document)
+    assert undercut(still).gamma == undercut(LOSSY).gamma
