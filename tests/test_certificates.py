@@ -89,7 +89,13 @@ def test_a_kind_is_not_believed(kind: str, check, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("gamma", "no_gamma"), ('"gamma":', '"gamma":NaN,"old":'), ("{", "[")],
+    [
+        ("gamma", "no_gamma"),
+        ('"gamma":', '"gamma":9.0,"gamma":'),
+        ('"A":', '"A":[[0.1]],"A":'),
+        ('"gamma":', '"gamma":NaN,"old":'),
+        ("{", "["),
+    ],
 )
 def test_what_cannot_be_read_is_undecided(old: str, new: str, check, tmp_path: Path) -> None:
     path = tmp_path / "gains.json"

@@ -1,9 +1,8 @@
 """Decides whether the gamma of a gains file is proved: exact integers, no solver, nothing but the standard library.
 
 python check_certificate.py GAINS.json: proved (exit code 0), disproved, with a vector (1), or undecided (3)
-Every float is the fraction that it is; digest, lower ends and words are not looked at. Equations are those of Zhu, Wen,
-Peng, Yang, Control and Decision 35(8), 2020; sections those of docs/theory.md. Vectors are [w; eta], eta = [x; e_1; ...
-e_n]; without x where gains are unbiased and no loss is hidden (section 9).
+Every float is the fraction that it is; digest, lower ends and words are not looked at. Equations: Zhu, Wen, Peng, Yang,
+Control and Decision 35(8), 2020; sections: docs/theory.md. Vectors: [w; eta], eta = [x; e_1; ... e_n], or no x (9).
 """
 import json, sys
 from fractions import Fraction as Q
@@ -12,6 +11,7 @@ from operator import mul
 SPARE, STEPS, ORDER = 100, 2000, 60  # binary places beyond those of the file; steps; the longest [w; eta] that is tried
 KEYS = "name plant node arrival_probability loss weight link topology markov unbiased disturbance tolerance uncertainty"
 MEAN = frozenset()  # a form is {chances: X}, the sum of all X [w; eta], each times its chances less their probabilities
+unique = lambda pairs: {key: value for (key, value), _ in zip(pairs, dict(pairs), strict=True)}  # no key is there twice
 zeros = lambda rows, columns: [[Q(0)] * columns for _ in range(rows)]
 eye = lambda size, by=Q(1): [[by * (i == j) for j in range(size)] for i in range(size)]
 turned = lambda X: [list(column) for column in zip(*X)]
@@ -113,7 +113,7 @@ if __name__ == "__main__":
     try:
         with open(sys.argv[1]) as gains:
             number = dict.fromkeys(("parse_float", "parse_int", "parse_constant"), lambda text: Q(float(text)))
-            code, words = decide(json.load(gains, **number))
+            code, words = decide(json.load(gains, object_pairs_hook=unique, **number))
     except (ArithmeticError, AssertionError, LookupError, OSError, TypeError, ValueError) as error:
         code, words = 3, f"{type(error).__name__}: {error}"
     print({0: "proved", 1: "disproved", 3: "undecided"}[code] + f": {words}")
