@@ -36,6 +36,29 @@ Fixpoint lifted (P : matrix) (X : list (list Q)) : matrix := (* y'Py where y are
 Fixpoint squares (X : list (list Q)) : matrix :=
   match X with [] => [] | x :: X' => mplus (product x x) (squares X') end.
 
+(* Products of long fractions, cut, and what that may do at most added on the diagonal. *)
+Fixpoint halved (k : nat) (a : Z) (d : positive) : Q :=
+  match k, d with S k', xO d' => halved k' (Z.div2 a) d' | _, _ => a # d end.
+Fixpoint raised (k : nat) (a : Z) (d : positive) : Q :=
+  match k, d with S k', xO d' => raised k' (Z.div2 a + 1) d' | _, _ => a # d end.
+Definition cut (digits : nat) (q : Q) : Q := halved (Z.to_nat (Z.log2 (Z.abs (Qnum q))) - digits) (Qnum q) (Qden q).
+Definition size (q : Q) : Q := (* |q| or more *)
+  match Qnum q with Z0 => 0 | a => raised (Z.to_nat (Z.log2 (Z.abs a)) - 8) (Z.abs a) (Qden q) end.
+Definition norm (x : list Q) : Q := size (fold_right qplus 0 (map size x)).
+Definition shadow (x u : list Q) : list Q :=
+  rtimes (1 # 2) (rplus (rtimes (norm u) (map size x)) (rtimes (norm x) (map size u))).
+Definition diagonal (x : list Q) : matrix := map (fun q => [q]) x.
+Definition rminus x u := rplus x (rtimes (-1) u).
+Definition product_above (digits : nat) (x u : list Q) : matrix :=
+  let x' := map (cut digits) x in let u' := map (cut digits) u in
+  mplus (product x' u') (diagonal (rplus (shadow (rminus x x') u) (shadow x' (rminus u u')))).
+Fixpoint lifted_above (digits : nat) (P : matrix) (X : list (list Q)) : matrix :=
+  match P, X with
+  | (a :: b) :: P', x :: X' =>
+      mplus (product_above digits x (rplus (rtimes a x) (rtimes 2 (combined b X')))) (lifted_above digits P' X')
+  | [] :: P', _ :: X' => lifted_above digits P' X'
+  | _, _ => [] end.
+
 (* What is left to chance: a Row whatever happens; Node a b is a and (1 or 0, less its probability) times b. *)
 Inductive random := Zero | Row (r : list Q) | Node (a b : random).
 Fixpoint onto (r : list Q) (t : random) : random :=
@@ -58,12 +81,12 @@ Fixpoint tchance (ps : list Q) (k : nat) (t : random) : random :=
   | S k' => Node (tchance (tl ps) k' (left t)) (tchance (tl ps) k' (right t)) end.
 Fixpoint row (t : random) := match t with Zero => [] | Row r => r | Node a _ => row a end.
 Definition nothing t := match t with Zero => true | _ => false end.
-Fixpoint spread (P : matrix) (ps : list Q) (ts : list random) : matrix := (* the mean of y'Py *)
+Fixpoint spread (digits : nat) (P : matrix) (ps : list Q) (ts : list random) : matrix := (* at least the mean of y'Py *)
   match ps with
-  | [] => lifted P (map row ts)
-  | p :: ps' => mplus (spread P ps' (map left ts))
+  | [] => lifted_above digits P (map row ts)
+  | p :: ps' => mplus (spread digits P ps' (map left ts))
       (if forallb nothing (map right ts) then []
-       else mtimes (qtimes p (others p)) (spread P ps' (map right ts))) end.
+       else mtimes (qtimes p (others p)) (spread digits P ps' (map right ts))) end.
 
 (* Positive definite: eliminated in integers, all that is divided rounded, and the diagonal lowered by what that may do. *)
 Fixpoint down (a : Z) (b : positive) : Z := match b with xO b' => down (Z.div2 a) b' | xH => a | _ => (a / Zpos b)%Z end.
@@ -75,18 +98,22 @@ Fixpoint whole (k : nat) (X : matrix) : matrix :=
 Definition rounded (X : matrix) := map (map (fun q => down (Qnum q) (Qden q))) X.
 Fixpoint rest_row {T} (op : T -> T -> T -> T) (row : list T) (b_i : T) (b : list T) : list T :=
   match row, b with c :: row', b_j :: b' => op c b_i b_j :: rest_row op row' b_i b' | _, _ => [] end.
-Fixpoint rest {T} (op : T -> T -> T -> T) (X : list (list T)) (b : list T) : list (list T) :=
-  match X, b with row :: X', b_i :: b' => rest_row op row b_i b :: rest op X' b' | _, _ => [] end.
+Fixpoint rest {T} (by_ : T -> T) (op : T -> T -> T -> T) (X : list (list T)) (b : list T) : list (list T) :=
+  match X, b with row :: X', b_i :: b' => rest_row op row (by_ b_i) b :: rest by_ op X' b' | _, _ => [] end.
 Fixpoint triangle {T} (k : nat) (X : list (list T)) : bool :=
   match k, X with
   | O, [] => true
   | S m, row :: X' => (length row =? k)%nat && triangle m X'
   | _, _ => false end.
+Definition places (b : list Z) : Z := Z.succ (fold_right Z.max 0 (map (fun c => Z.log2 (Z.abs c)) b))%Z.
 Fixpoint positive_definite (k : nat) (X : list (list Z)) : bool :=
   match k, X with
   | O, [] => true
-  | S m, (a :: b) :: X' => (0 <? a)%Z && (length b =? m)%nat && triangle m X' &&
-      positive_definite m (lowered (Z.of_nat m) (rest (fun c b_i b_j => c - b_i * b_j / a)%Z X' b))
+  | S m, (a :: b) :: X' => (* what is left is X' - b b' / a *)
+      let p := places b in
+      (0 <? a)%Z && (length b =? m)%nat && triangle m X' && forallb (fun c => Z.abs c <=? 2 ^ p)%Z b &&
+      positive_definite m (lowered (2 * Z.of_nat m)
+        (rest (fun c => c * 2 ^ p / a)%Z (fun c b_i b_j => c - down (b_i * b_j) (Z.to_pos (2 ^ p)))%Z X' b))
   | _, _ => false end.
 Definition none (q : Q) := Qeq_bool q 0.
 Fixpoint within (k : nat) (X : matrix) : bool := (* no entry beyond the first k rows and columns *)
@@ -94,11 +121,11 @@ Fixpoint within (k : nat) (X : matrix) : bool := (* no entry beyond the first k 
   | _, [] => true
   | O, _ => forallb (forallb none) X
   | S k', row :: X' => forallb none (skipn k row) && within k' X' end.
-Fixpoint first (ok : Q -> bool) (units : list Q) : bool :=
-  match units with [] => false | unit :: finer => if ok unit then true else first ok finer end.
-Definition positive (k : nat) (X : matrix) : bool :=
-  within k X && first (fun unit => positive_definite k (lowered (Z.of_nat k) (rounded (mtimes unit (whole k X)))))
-    [0x1p80; 0x1p160; 0x1p320].
+Fixpoint first (ok : nat -> bool) (digits : list nat) : bool :=
+  match digits with [] => false | d :: more => if ok d then true else first ok more end.
+Definition positive (k : nat) (X : nat -> matrix) : bool :=
+  first (fun digits => within k (X digits) && positive_definite k (lowered (2 * Z.of_nat k)
+    (rounded (mtimes (inject_Z (2 ^ Z.of_nat digits)) (whole k (X digits)))))) [64; 128; 320]%nat.
 
 Section Decide.
 Variables (f : network) (gamma : Q) (with_x : bool).
@@ -115,16 +142,21 @@ Definition next_forms s := eta random tplus ttimes with_x
   (step random Zero tplus ttimes (tchance (chances f)) f s (map Row x_forms, map (map Row) (snd st_forms)) (map Row w_forms)).
 Definition likely s := nth s (Pi f) [].
 Definition mixed s (P : list matrix) := fold_right mplus [] (map (fun t => mtimes (entry s t (Pi f) 0) (nth t P [])) (seq 0 (modes f))).
-Definition matrix_17 s (here : matrix) (next : list matrix) := (* times the sum of the row of Pi *)
+Definition matrix_17 forms s (here : matrix) (next : list matrix) digits := (* times the sum of the row of Pi *)
   mplus (mtimes (fold_right qplus 0 (likely s)) (mplus (squares w_forms) (lifted here eta_forms)))
-        (mtimes (-1) (spread (mixed s next) (chances f) (next_forms s))).
-Definition matrix_18 (here : matrix) := mplus (mtimes (qtimes gamma gamma) (lifted here eta_forms)) (mtimes (-1) (squares z_forms)).
-Definition all (ok : nat -> bool) := forallb ok (seq 0 (modes f)).
-Definition decide_17 (here next : list matrix) := all (fun s => positive order (matrix_17 s (nth s here []) next)).
-Definition decide_18 (here : list matrix) := all (fun s => positive order (mplus (squares w_forms) (matrix_18 (nth s here [])))).
-Fixpoint chain (levels : list (list matrix)) : bool :=
+        (mtimes (-1) (spread digits (mixed s next) (chances f) (nth s forms []))).
+Definition matrix_18 (here : matrix) :=
+  mplus (mtimes (qtimes gamma gamma) (lifted here eta_forms)) (mtimes (-1) (squares z_forms)).
+Definition every (ok : nat -> bool) := forallb ok (seq 0 (modes f)).
+Definition decide_17 forms (here next : list matrix) := every (fun s => positive order (matrix_17 forms s (nth s here []) next)).
+Definition decide_18 (here : list matrix) :=
+  every (fun s => positive order (fun _ => mplus (squares w_forms) (matrix_18 (nth s here [])))).
+Fixpoint chain forms (levels : list (list matrix)) : bool :=
   match levels with
   | [] => false
-  | P :: below => match below with [] => decide_17 P P | P' :: _ => decide_17 P' P && chain below end end.
-Definition decide (levels : list (list matrix)) := proper f && Qle_bool 0 gamma && decide_18 (hd [] levels) && chain levels.
+  | P :: below =>
+      match below with [] => decide_17 forms P P | P' :: _ => if decide_17 forms P' P then chain forms below else false end end.
+Definition all_forms := map next_forms (seq 0 (modes f)).
+Definition decide (levels : list (list matrix)) :=
+  proper f && Qle_bool 0 gamma && decide_18 (hd [] levels) && chain all_forms levels.
 End Decide.

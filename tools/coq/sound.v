@@ -69,6 +69,115 @@ Proof.
   simpl. rewrite form_plus, form_product, IH. unfold norm2. reflexivity.
 Qed.
 
+(* Products that are cut are not below what they were. *)
+Lemma raised_ok : forall k a d, (0 <= a)%Z -> Q2R (a # d) <= Q2R (raised k a d).
+Proof.
+  induction k as [|k IH]; intros a d A; [simpl; lra|]. destruct d as [d|d|]; simpl; try lra.
+  assert (0 <= Z.div2 a)%Z by (apply Z.div2_nonneg; auto).
+  eapply Rle_trans; [|apply IH; lia]. unfold Q2R; cbn [Qnum Qden].
+  replace (/ IZR (Zpos d~0)) with (/ 2 * / IZR (Zpos d)) by (rewrite <- Rinv_mult, <- mult_IZR; reflexivity).
+  rewrite <- Rmult_assoc. apply Rmult_le_compat_r; [left; apply Rinv_0_lt_compat, IZR_lt; lia|].
+  rewrite plus_IZR. assert (IZR a <= 2 * IZR (Z.div2 a) + 1); [|lra].
+  rewrite <- mult_IZR, <- plus_IZR. apply IZR_le. rewrite Z.div2_div.
+  pose proof (Z.div_mod a 2 ltac:(lia)). pose proof (Z.mod_pos_bound a 2 ltac:(lia)). lia.
+Qed.
+Lemma size_ok : forall q, Rabs (Q2R q) <= Q2R (size q).
+Proof.
+  intros [a d]. unfold size. cbn [Qnum Qden].
+  assert (E : Rabs (Q2R (a # d)) = Q2R (Z.abs a # d)).
+  { unfold Q2R; cbn [Qnum Qden]. rewrite Rabs_mult, <- abs_IZR. f_equal. apply Rabs_pos_eq.
+    left. apply Rinv_0_lt_compat, IZR_lt. lia. }
+  destruct a as [|a|a]; [unfold Q2R; simpl; rewrite !Rmult_0_l, Rabs_R0; lra | |]; rewrite E; apply raised_ok; lia.
+Qed.
+Lemma Q2R_sum : forall l, Q2R (fold_right qplus 0%Q l) = sum (map Q2R l).
+Proof. induction l; simpl; [apply Q2R_0|]. rewrite qplus_ok, IHl. reflexivity. Qed.
+Lemma norm_ok : forall x, sum (map Q2R (map size x)) <= Q2R (norm x).
+Proof. intro x. unfold norm. rewrite <- Q2R_sum. eapply Rle_trans; [apply Rle_abs | apply size_ok]. Qed.
+
+Definition major (b B : list R) := Forall2 (fun p q => Rabs p <= q) b B.
+Definition squared (v : list R) := map (fun y => y * y) v.
+Lemma major_size : forall x, major (map Q2R x) (map Q2R (map size x)).
+Proof. unfold major. induction x; simpl; constructor; auto. apply size_ok. Qed.
+Lemma major_sum : forall b B, major b B -> 0 <= sum B.
+Proof. intros b B M. induction M as [|p q b B E M IH]; simpl; [lra|]. pose proof (Rabs_pos p). unfold sum in *. lra. Qed.
+Lemma major_inner : forall b B v, major b B -> 0 <= inner B (squared v).
+Proof.
+  intros b B v M. revert v. induction M as [|p q b B E M IH]; intros [|y v]; simpl; try lra.
+  pose proof (Rabs_pos p). pose proof (IH v). pose proof (Rle_0_sqr y) as S. unfold Rsqr in S. nra.
+Qed.
+Lemma pair_1 : forall b B, major b B -> forall y v,
+  2 * Rabs (y * inner b v) <= sum B * (y * y) + inner B (squared v).
+Proof.
+  intros b B M. induction M as [|p q b B E M IH]; intros y [|c v]; simpl.
+  - rewrite Rmult_0_r, Rabs_R0. lra.
+  - rewrite Rmult_0_r, Rabs_R0. lra.
+  - rewrite Rmult_0_r, Rabs_R0. pose proof (Rabs_pos p). pose proof (major_sum b B M). pose proof (Rle_0_sqr y) as S.
+    unfold Rsqr, sum in *. nra.
+  - rewrite Rmult_plus_distr_l. pose proof (Rabs_triang (y * (p * c)) (y * inner b v)) as T. specialize (IH y v).
+    assert (2 * Rabs (y * (p * c)) <= q * (y * y) + q * (c * c)).
+    { replace (y * (p * c)) with (p * (y * c)) by ring. rewrite Rabs_mult.
+      assert (2 * Rabs (y * c) <= y * y + c * c).
+      { pose proof (Rle_0_sqr (y - c)) as S1. pose proof (Rle_0_sqr (y + c)) as S2. unfold Rsqr in *.
+        unfold Rabs. destruct (Rcase_abs (y * c)); lra. }
+      pose proof (Rabs_pos p). pose proof (Rabs_pos (y * c)).
+      pose proof (Rmult_le_compat (Rabs p) q (2 * Rabs (y * c)) (y * y + c * c)). lra. }
+    unfold sum in *. lra.
+Qed.
+Lemma pair_2 : forall a A b B, major a A -> major b B -> forall v,
+  2 * Rabs (inner a v * inner b v) <= sum B * inner A (squared v) + sum A * inner B (squared v).
+Proof.
+  intros a A b B MA MB. induction MA as [|p q a A E MA IH]; intros v.
+  - simpl. rewrite !Rmult_0_l, Rabs_R0. lra.
+  - assert (G : forall u v, 2 * Rabs (inner a u * inner b v) <= sum B * inner A (squared u) + sum A * inner B (squared v)).
+    { clear IH q p E v. induction MA as [|p q a A E MA IH]; intros u v; [simpl; rewrite !Rmult_0_l, Rabs_R0; lra|].
+      pose proof (major_sum a A MA). pose proof (major_sum b B MB). pose proof (major_inner b B v MB). pose proof (Rabs_pos p).
+      destruct u as [|y u]; simpl; [rewrite Rmult_0_l, Rabs_R0; unfold sum in *; nra|].
+      rewrite Rmult_plus_distr_r. pose proof (Rabs_triang (p * y * inner b v) (inner a u * inner b v)) as T.
+      specialize (IH u v). pose proof (pair_1 b B MB y v) as O.
+      replace (p * y * inner b v) with (p * (y * inner b v)) in * by ring. rewrite Rabs_mult in T.
+      pose proof (Rabs_pos (y * inner b v)). unfold sum in *. nra. }
+    pose proof (major_sum a A MA). pose proof (major_sum b B MB). pose proof (major_inner b B v MB). pose proof (Rabs_pos p).
+    destruct v as [|y v]; [simpl; rewrite Rmult_0_l, Rabs_R0; destruct B; simpl; lra|].
+    cbn [inner]. rewrite Rmult_plus_distr_r.
+    pose proof (Rabs_triang (p * y * inner b (y :: v)) (inner a v * inner b (y :: v))) as T.
+    pose proof (G v (y :: v)) as O1. pose proof (pair_1 b B MB y (y :: v)) as O.
+    replace (p * y * inner b (y :: v)) with (p * (y * inner b (y :: v))) in * by ring. rewrite Rabs_mult in T.
+    pose proof (Rabs_pos (y * inner b (y :: v))). change (squared (y :: v)) with (y * y :: squared v) in *. cbn [inner] in *.
+    unfold sum in *. simpl fold_right. nra.
+Qed.
+Lemma form_diagonal : forall r v, formQ (diagonal r) v = inner (map Q2R r) (squared v).
+Proof. unfold formQ. induction r as [|q r IH]; intros [|y v]; simpl; auto. rewrite IH. ring. Qed.
+Lemma inner_times : forall q x v, inner (map Q2R (rtimes q x)) v = Q2R q * inner (map Q2R x) v.
+Proof. intros. apply val_times. Qed.
+Lemma shadow_ok : forall x u v, Rabs (val v x * val v u) <= formQ (diagonal (shadow x u)) v.
+Proof.
+  intros x u v. rewrite form_diagonal. unfold shadow. change (inner (map Q2R ?r) ?s) with (val s r).
+  rewrite val_times, val_plus, !val_times. unfold val.
+  pose proof (pair_2 _ _ _ _ (major_size x) (major_size u) v) as P. pose proof (norm_ok x). pose proof (norm_ok u).
+  pose proof (major_inner _ _ v (major_size x)). pose proof (major_inner _ _ v (major_size u)).
+  replace (Q2R (1 # 2)) with (/ 2) by (unfold Q2R; simpl; lra). nra.
+Qed.
+Lemma val_minus : forall x y v, val v (rminus x y) = val v x - val v y.
+Proof. intros. unfold rminus. rewrite val_plus, val_times, Q2R_opp1. lra. Qed.
+Lemma form_product_above : forall d x u v, val v x * val v u <= formQ (product_above d x u) v.
+Proof.
+  intros d x u v. unfold product_above. cbv zeta. set (x' := map (cut d) x). set (u' := map (cut d) u).
+  rewrite form_plus, form_product, form_diagonal. change (inner (map Q2R ?r) ?s) with (val s r).
+  rewrite val_plus. unfold val at 5 6. rewrite <- !form_diagonal.
+  pose proof (shadow_ok (rminus x x') u v) as E1. pose proof (shadow_ok x' (rminus u u') v) as E2.
+  rewrite val_minus in E1, E2.
+  pose proof (Rle_abs ((val v x - val v x') * val v u)). pose proof (Rle_abs (val v x' * (val v u - val v u'))). lra.
+Qed.
+Lemma form_lifted_above : forall d P X v, formQ P (map (val v) X) <= formQ (lifted_above d P X) v.
+Proof.
+  induction P as [|[|a b] P IH]; intros [|x X] v; try (simpl; destruct v; simpl; unfold formQ; simpl; lra); simpl.
+  - apply IH.
+  - rewrite form_plus. specialize (IH X v).
+    pose proof (form_product_above d x (rplus (rtimes a x) (rtimes 2 (combined b X))) v) as E.
+    rewrite val_plus, !val_times, val_combined in E. unfold formQ at 1; cbn [map form].
+    replace (Q2R 2) with 2 in E by (unfold Q2R; simpl; lra). unfold formQ at 1 in IH. nra.
+Qed.
+
 Lemma inner_zero : forall b x, zero x -> inner b x = 0.
 Proof. induction b; intros x Z; destruct Z as [|y x E Z]; simpl; auto. rewrite E, IHb; auto. lra. Qed.
 Lemma form_zero : forall P x, zero x -> form P x = 0.
@@ -133,14 +242,20 @@ Proof.
   intros ps g c. rewrite (mean_ext _ _ (fun o => 0 + c * g o)) by (intro; lra).
   rewrite (mean_line ps (fun _ => 0)), mean_zero by auto. lra.
 Qed.
-Lemma mean_spread : forall ps P ts v, mean ps (fun o => formQ P (map (value ps o v) ts)) = formQ (spread P ps ts) v.
+Lemma probable_ok : forall p, probable p = true -> 0 <= Q2R p <= 1.
 Proof.
-  induction ps as [|p ps IH]; intros P ts v.
-  - simpl. rewrite form_lifted, map_map. f_equal. apply map_ext. intro t. 
-    assert (forall t, value [] [] v t = val v (row t)) as ->; auto.
-    induction t0; simpl; unfold val; simpl; auto; try (destruct v; reflexivity).
-    rewrite Q2R_0. unfold val in IHt0_1. rewrite IHt0_1. lra.
-  - assert (S : forall c o, formQ P (map (value (p :: ps) (c :: o) v) ts) =
+  intros p P. apply andb_true_iff in P as [A B]. apply Qle_bool_iff, Qle_Rle in A. apply Qle_bool_iff, Qle_Rle in B.
+  rewrite Q2R_0 in A. rewrite Q2R_1 in B. auto.
+Qed.
+Lemma mean_spread : forall d ps P ts v, forallb probable ps = true ->
+  mean ps (fun o => formQ P (map (value ps o v) ts)) <= formQ (spread d P ps ts) v.
+Proof.
+  induction ps as [|p ps IH]; intros P ts v G.
+  - simpl. eapply Rle_trans; [|apply form_lifted_above]. rewrite map_map. apply Req_le. f_equal. apply map_ext.
+    induction a; simpl; unfold val; simpl; auto; try (destruct v; reflexivity).
+    rewrite Q2R_0. unfold val in IHa1. rewrite IHa1. lra.
+  - simpl in G. apply andb_true_iff in G as [Gp G]. apply probable_ok in Gp.
+    assert (S : forall c o, formQ P (map (value (p :: ps) (c :: o) v) ts) =
       formQ P (map (fun t => value ps o v (left t) + ((if c : bool then 1 else 0) - Q2R p) * value ps o v (right t)) ts)).
     { intros c o. f_equal. apply map_ext. intro t. rewrite value_split. reflexivity. }
     assert (E : forall o, Q2R p * formQ P (map (value (p :: ps) (true :: o) v) ts) +
@@ -149,19 +264,19 @@ Proof.
     { intro o. rewrite !S, !map_map. unfold formQ.
       destruct (form_line (map (map Q2R) P) (fun t => value ps o v (left t)) (fun t => value ps o v (right t)) ts) as [b L].
       rewrite !L. lra. }
-    simpl. transitivity (mean ps (fun o => formQ P (map (value ps o v) (map left ts)) +
+    apply Rle_trans with (mean ps (fun o => formQ P (map (value ps o v) (map left ts)) +
       (Q2R p * (1 - Q2R p)) * formQ P (map (value ps o v) (map right ts)))).
-    + rewrite <- (mean_ext _ _ _ E), mean_line, mean_times. reflexivity.
-    + rewrite mean_line, !IH. rewrite form_plus. f_equal.
+    + apply Req_le. simpl. rewrite <- (mean_ext _ _ _ E), mean_line, mean_times. reflexivity.
+    + rewrite mean_line. simpl. rewrite form_plus. apply Rplus_le_compat; [apply IH; auto|].
+      assert (0 <= Q2R p * (1 - Q2R p)) by nra.
       destruct (forallb nothing (map right ts)) eqn:N.
-      * replace (formQ [] v) with 0 by (destruct v; reflexivity).
-        rewrite <- IH. replace (mean ps _) with 0; [lra|]. 
-        symmetry. apply mean_zero. intro o. apply form_zero. unfold zero. rewrite Forall_map, Forall_forall. intros t I.
+      * apply Req_le. replace (formQ [] v) with 0 by (destruct v; reflexivity).
+        rewrite mean_zero; [lra|]. intro o. apply form_zero. unfold zero. rewrite Forall_map, Forall_forall. intros t I.
         rewrite forallb_forall in N. specialize (N t I). destruct t; try discriminate. reflexivity.
-      * rewrite form_times, qtimes_ok, others_ok. lra.
+      * rewrite form_times, qtimes_ok, others_ok. apply Rmult_le_compat_l; auto.
 Qed.
 
-Definition near p q := -1 <= p - q <= 1.
+Definition near p q := -2 <= p - q <= 2.
 Definition RZ := map (map IZR).
 Lemma down_ok : forall b a, down a b = (a / Zpos b)%Z.
 Proof.
@@ -192,7 +307,7 @@ Proof.
   apply andb_true_iff in T as [_ T]. rewrite IHk by (auto; lia). rewrite norm2_cons, minus_IZR. lra.
 Qed.
 Lemma inner_near : forall b d x y, Forall2 near b d ->
-  2 * y * inner d x - INR (length b) * (y * y) - norm2 x <= 2 * y * inner b x.
+  2 * y * inner d x - 2 * (INR (length b) * (y * y)) - 2 * norm2 x <= 2 * y * inner b x.
 Proof.
   induction b as [|p b IH]; intros d x y N; inversion N as [|? q ? d' E N']; subst.
   - simpl. pose proof (norm2_pos x). destruct x; lra.
@@ -200,13 +315,13 @@ Proof.
     { cbn [inner]. pose proof (pos_INR (length (p :: b))). unfold norm2. simpl (sum _).
       pose proof (Rle_0_sqr y) as S. unfold Rsqr in S. pose proof (Rmult_le_pos _ _ H S). lra. }
     specialize (IH d' x y N'). rewrite norm2_cons. cbn [inner]. change (length (p :: b)) with (S (length b)). rewrite S_INR.
-    assert (- (y * y + c * c) <= 2 * y * ((p - q) * c)); [|lra].
+    assert (- (2 * (y * y) + 2 * (c * c)) <= 2 * y * ((p - q) * c)); [|lra].
     unfold near in E. set (e := p - q) in *.
-    assert (0 <= (y + e * c) * (y + e * c)) by apply Rle_0_sqr.
-    assert (e * e <= 1) by nra. nra.
+    assert (0 <= (2 * y + e * c) * (2 * y + e * c)) by apply Rle_0_sqr.
+    assert (e * e <= 4) by nra. nra.
 Qed.
 Lemma form_near : forall k X Y v, Forall2 (Forall2 near) X Y -> triangle k X = true ->
-  length v = k -> form Y v - INR k * norm2 v <= form X v.
+  length v = k -> form Y v - 2 * INR k * norm2 v <= form X v.
 Proof.
   induction k as [|k IH]; intros X Y v N T L; destruct v as [|y v]; try discriminate.
   - destruct X; try discriminate. inversion N; subst. unfold norm2; simpl; lra.
@@ -215,7 +330,7 @@ Proof.
     inversion N as [|? R ? Y' N1 N2]; subst. inversion N1 as [|? c ? d E N3]; subst.
     specialize (IH X Y' v N2 T L). pose proof (inner_near b d v y N3) as I.
     rewrite norm2_cons, S_INR. unfold near in E. cbn [form]. pose proof (Rle_0_sqr y) as S. unfold Rsqr in S.
-    pose proof (Rmult_le_pos (a - c + 1) (y * y) ltac:(lra) S). lra.
+    pose proof (Rmult_le_pos (a - c + 2) (y * y) ltac:(lra) S). lra.
 Qed.
 Lemma inner_rest : forall a row b f x, length row = length b ->
   inner (rest_row (fun c p q => c - p * q / a) row f b) x = inner row x - f * inner b x / a.
@@ -223,32 +338,56 @@ Proof.
   induction row as [|c row IH]; intros [|g b] f [|y x] L; simpl in *; try discriminate; try (unfold Rdiv; ring).
   rewrite IH by lia. unfold Rdiv; ring.
 Qed.
+Definition kept (c : R) := c.
 Lemma form_rest : forall a X b x, triangle (length b) X = true ->
-  form (rest (fun c p q => c - p * q / a) X b) x = form X x - inner b x * inner b x / a.
+  form (rest kept (fun c p q => c - p * q / a) X b) x = form X x - inner b x * inner b x / a.
 Proof.
   induction X as [|row X IH]; intros [|f b] x T; simpl in T; try discriminate; [destruct x; simpl; unfold Rdiv; ring|].
   apply andb_true_iff in T as [L T]. apply Nat.eqb_eq in L. destruct row as [|c row]; [discriminate|]. injection L as L.
-  destruct x as [|y x]; [simpl; unfold Rdiv; ring|]. cbn [rest rest_row form inner].
+  destruct x as [|y x]; [simpl; unfold Rdiv; ring|]. cbn [rest rest_row form inner]. unfold kept at 1 2 3.
   rewrite inner_rest, IH by auto. unfold Rdiv; ring.
 Qed.
-Lemma rest_row_near : forall a row f b, (0 < a)%Z -> Forall2 near
+Section Rest.
+Variables (a p : Z).
+Hypotheses (A : (0 < a)%Z) (P : (0 <= p)%Z).
+Definition share c := (c * 2 ^ p / a)%Z.
+Definition left_over c b_i b_j := (c - down (b_i * b_j) (Z.to_pos (2 ^ p)))%Z.
+Lemma entry_near : forall c f g, (Z.abs g <= 2 ^ p)%Z ->
+  near (IZR c - IZR f * IZR g / IZR a) (IZR (left_over c (share f) g)).
+Proof.
+  intros c f g G. unfold left_over, share. rewrite down_ok. assert (T : (0 < 2 ^ p)%Z) by (apply Z.pow_pos_nonneg; lia).
+  rewrite Z2Pos.id by auto. set (t := (2 ^ p)%Z) in *. assert (A' := IZR_lt _ _ A). assert (T' := IZR_lt _ _ T). simpl in A', T'.
+  pose proof (floor_near (f * t) a A) as N1. set (s := (f * t / a)%Z) in *.
+  pose proof (floor_near (s * g) t T) as N2. rewrite mult_IZR in N1, N2. rewrite minus_IZR.
+  apply IZR_le in G. rewrite abs_IZR in G. unfold near.
+  assert (E : IZR f * IZR g / IZR a = (IZR f * IZR t / IZR a) * IZR g / IZR t) by (field; lra).
+  rewrite E. set (r := IZR f * IZR t / IZR a) in *.
+  assert (D : -1 <= (r - IZR s) * IZR g / IZR t <= 1).
+  { assert (Rabs ((r - IZR s) * IZR g) <= 1 * IZR t).
+    { rewrite Rabs_mult. apply Rmult_le_compat; auto using Rabs_pos. rewrite Rabs_pos_eq; lra. }
+    assert (B : - IZR t <= (r - IZR s) * IZR g <= IZR t) by (unfold Rabs in H; destruct (Rcase_abs _) in H; lra).
+    split; apply (Rmult_le_reg_r (IZR t)); auto; unfold Rdiv; rewrite Rmult_assoc, Rinv_l by lra; lra. }
+  replace (r * IZR g / IZR t) with (IZR s * IZR g / IZR t + (r - IZR s) * IZR g / IZR t) by (field; lra). lra.
+Qed.
+Lemma rest_row_near : forall row f b, forallb (fun c => Z.abs c <=? 2 ^ p)%Z b = true -> Forall2 near
   (rest_row (fun c p q => c - p * q / IZR a) (map IZR row) (IZR f) (map IZR b))
-  (map IZR (rest_row (fun c p q => c - p * q / a)%Z row f b)).
+  (map IZR (rest_row left_over row (share f) b)).
 Proof.
-  induction row as [|c row IH]; intros f [|g b] A; simpl; constructor; auto.
-  pose proof (floor_near (f * g) a A) as N. rewrite mult_IZR in N. rewrite minus_IZR. unfold near. lra.
+  induction row as [|c row IH]; intros f [|g b] G; simpl; constructor; simpl in G; apply andb_true_iff in G as [G1 G2]; auto.
+  apply entry_near. apply Z.leb_le. auto.
 Qed.
-
-Lemma rest_near : forall a X b, (0 < a)%Z -> Forall2 (Forall2 near)
-  (rest (fun c p q => c - p * q / IZR a) (RZ X) (map IZR b)) (RZ (rest (fun c p q => c - p * q / a)%Z X b)).
+Lemma rest_near : forall X b, forallb (fun c => Z.abs c <=? 2 ^ p)%Z b = true -> Forall2 (Forall2 near)
+  (rest kept (fun c p q => c - p * q / IZR a) (RZ X) (map IZR b)) (RZ (rest share left_over X b)).
 Proof.
-  induction X as [|row X IH]; intros [|f b] A; try (simpl; constructor).
-  - exact (rest_row_near a row f (f :: b) A).
-  - apply IH; auto.
+  induction X as [|row X IH]; intros [|f b] G; try (simpl; constructor).
+  - exact (rest_row_near row f (f :: b) G).
+  - apply IH. simpl in G. apply andb_true_iff in G as [_ G]. auto.
 Qed.
+End Rest.
 Lemma rest_row_length : forall {T} (op : T -> T -> T -> T) row f b, length row = length b -> length (rest_row op row f b) = length b.
 Proof. induction row as [|c row IH]; intros f [|g b] L; simpl in *; try discriminate; auto. Qed.
-Lemma rest_triangle : forall {T} (op : T -> T -> T -> T) k X b, triangle k X = true -> length b = k -> triangle k (rest op X b) = true.
+Lemma rest_triangle : forall {T} (g : T -> T) (op : T -> T -> T -> T) k X b,
+  triangle k X = true -> length b = k -> triangle k (rest g op X b) = true.
 Proof.
   induction k as [|k IH]; intros [|row X] [|f b] T1 L; simpl in *; try discriminate; auto.
   apply andb_true_iff in T1 as [R T1]. apply Nat.eqb_eq in R. rewrite rest_row_length by (simpl; lia). simpl.
@@ -264,13 +403,16 @@ Lemma definite : forall k X v, positive_definite k X = true -> length v = k -> ~
 Proof.
   induction k as [|k IH]; intros X v P L N; destruct v as [|y v]; try discriminate.
   - exfalso; apply N; constructor.
-  - destruct X as [|[|a b] X]; try discriminate. simpl in P. injection L as L.
-    apply andb_true_iff in P as [P R]. apply andb_true_iff in P as [P T]. apply andb_true_iff in P as [A B].
-    apply Z.ltb_lt in A. apply Nat.eqb_eq in B. assert (A' := IZR_lt _ _ A). simpl in A'.
-    set (rst := rest (fun c p q => c - p * q / a)%Z X b) in *.
+  - destruct X as [|[|a b] X]; try discriminate. cbn [positive_definite] in P. cbv zeta in P. injection L as L.
+    apply andb_true_iff in P as [P R]. apply andb_true_iff in P as [P G]. apply andb_true_iff in P as [P T].
+    apply andb_true_iff in P as [A B]. apply Z.ltb_lt in A. apply Nat.eqb_eq in B. assert (A' := IZR_lt _ _ A). simpl in A'.
+    assert (P0 : (0 <= places b)%Z).
+    { unfold places. assert (0 <= fold_right Z.max 0 (map (fun c => Z.log2 (Z.abs c)) b))%Z by (clear; induction b; simpl; lia). lia. }
+    change (rest _ _ X b) with (rest (share a (places b)) (left_over (places b)) X b) in R.
+    set (rst := rest (share a (places b)) (left_over (places b)) X b) in *.
     assert (T' : triangle k rst = true) by (apply rest_triangle; auto).
-    assert (G : form (RZ (lowered (Z.of_nat k) rst)) v <= form (RZ X) v - inner (map IZR b) v * inner (map IZR b) v / IZR a).
-    { rewrite (form_lowered k) by auto. rewrite <- INR_IZR_INZ.
+    assert (F : form (RZ (lowered (2 * Z.of_nat k) rst)) v <= form (RZ X) v - inner (map IZR b) v * inner (map IZR b) v / IZR a).
+    { rewrite (form_lowered k) by auto. rewrite mult_IZR, <- INR_IZR_INZ.
       rewrite <- (form_rest (IZR a) (RZ X) (map IZR b) v) by (rewrite map_length, B; unfold RZ; now rewrite triangle_map).
       apply form_near; auto; [now apply rest_near|].
       apply rest_triangle; [unfold RZ; now rewrite triangle_map | now rewrite map_length]. }
@@ -283,7 +425,7 @@ Proof.
       rewrite I, Q0. assert (y <> 0) by (intro; apply N; constructor; auto).
       replace (y + 0 / IZR a) with y by (field; lra). replace (0 - 0 * 0 / IZR a) with 0 by (field; lra).
       assert (0 < y * y) by nra. nra.
-    + specialize (IH _ v R L Z). nra.
+    + specialize (IH _ v R L Z). apply Rplus_le_lt_0_compat; [apply Rmult_le_pos; lra | lra].
 Qed.
 
 Lemma padded_cons : forall k r, padded (S k) r = hd 0%Q r :: padded k (tl r).
@@ -336,23 +478,22 @@ Proof.
   induction r as [|[a b] r IH]; simpl; constructor; auto.
   rewrite down_ok. unfold near, Q2R; simpl. pose proof (floor_near a (Zpos b) eq_refl). unfold Rdiv in *. lra.
 Qed.
-Lemma first_ok : forall ok units, first ok units = true -> exists unit, In unit units /\ ok unit = true.
+Lemma first_ok : forall ok digits, first ok digits = true -> exists d, ok d = true.
 Proof.
-  induction units as [|unit units IH]; simpl; [discriminate|]. destruct (ok unit) eqn:E; [eauto|].
-  intro F. destruct (IH F) as [u [I O]]. eauto.
+  induction digits as [|d digits IH]; simpl; [discriminate|]. destruct (ok d) eqn:E; [eauto|]. apply IH.
 Qed.
-Lemma positive_ok : forall k X v u, positive k X = true -> length v = k -> ~ zero v -> 0 < formQ X (v ++ u).
+Lemma positive_ok : forall k X, positive k X = true -> exists d, within k (X d) = true /\
+  forall v u, length v = k -> ~ zero v -> 0 < formQ (X d) (v ++ u).
 Proof.
-  intros k X v u P L N. apply andb_true_iff in P as [W P]. rewrite (form_within X k) by auto.
-  apply first_ok in P as [unit [U D]].
-  assert (0 <= Q2R unit) by (destruct U as [<-|[<-|[<-|[]]]]; unfold Q2R; simpl; lra).
-  apply definite with (v := v) in D; auto.
-  set (Y := mtimes unit (whole k X)) in *.
+  intros k X P. apply first_ok in P as [d P]. exists d. apply andb_true_iff in P as [W D]. split; auto. intros v u L N.
+  rewrite (form_within (X d) k) by auto. apply definite with (v := v) in D; auto.
+  set (unit := inject_Z (2 ^ Z.of_nat d)) in *. set (Y := mtimes unit (whole k (X d))) in *.
+  assert (U : 0 <= Q2R unit) by (unfold unit, inject_Z, Q2R; simpl; rewrite Rinv_1, Rmult_1_r; apply IZR_le, Z.pow_nonneg; lia).
   assert (T : triangle k Y = true) by (unfold Y, mtimes, rtimes; rewrite triangle_map; apply whole_triangle).
-  assert (F : formQ Y v = Q2R unit * formQ X v) by (unfold Y; rewrite form_times, form_whole; auto).
+  assert (F : formQ Y v = Q2R unit * formQ (X d) v) by (unfold Y; rewrite form_times, form_whole; auto).
   rewrite (form_lowered k) in D by (auto; unfold rounded; now rewrite triangle_map).
   pose proof (form_near k _ _ v (rounded_near Y) ltac:(now rewrite triangle_map) L) as G.
-  rewrite <- INR_IZR_INZ in D. fold (formQ Y v) in G. rewrite F in G. nra.
+  rewrite mult_IZR, <- INR_IZR_INZ in D. fold (formQ Y v) in G. rewrite F in G. nra.
 Qed.
 
 (* What the model says of linear forms, it says of their values. *)
@@ -492,8 +633,6 @@ Proof.
   induction l as [|i l IH]; intro L; simpl; [lra|]. pose proof (L i (or_introl eq_refl)).
   pose proof (IH (fun j J => L j (or_intror J))). unfold sum in *. lra.
 Qed.
-Lemma Q2R_sum : forall l, Q2R (fold_right qplus 0%Q l) = sum (map Q2R l).
-Proof. induction l; simpl; [apply Q2R_0|]. rewrite qplus_ok, IHl. reflexivity. Qed.
 Lemma form_mixed : forall f s P v, formQ (mixed f s P) v =
   sum (map (fun t => Q2R (entry s t (Pi f) 0%Q) * formQ (nth t P []) v) (seq 0 (modes f))).
 Proof.
@@ -514,16 +653,23 @@ Proof.
 Qed.
 
 Definition total f s := sum (map Q2R (nth s (Pi f) [])).
-Lemma form_17 : forall f x s here P w st, length w = n_w f -> fits f st ->
-  formQ (matrix_17 f x s here P) (at_ w st) = total f s * (norm2 w + formQ here (etaR x st)) -
+Lemma forms_at : forall f x s, (s < modes f)%nat -> nth s (all_forms f x) [] = next_forms f x s.
+Proof.
+  intros f x s S. unfold all_forms. rewrite (nth_indep _ [] (next_forms f x 0)) by (rewrite map_length, seq_length; auto).
+  rewrite map_nth, seq_nth; auto.
+Qed.
+Lemma form_17 : forall f x s here P d w st,
+  forallb probable (chances f) = true -> (s < modes f)%nat -> length w = n_w f -> fits f st ->
+  formQ (matrix_17 f x (all_forms f x) s here P d) (at_ w st) <= total f s * (norm2 w + formQ here (etaR x st)) -
     mean (chances f) (fun o => sum (map (fun t => Q2R (entry s t (Pi f) 0%Q) * V x P t (next f o s st w)) (seq 0 (modes f)))).
 Proof.
-  intros f x s here P w st L F. unfold matrix_17, total, likely.
+  intros f x s here P d w st G S L F. unfold matrix_17, total, likely. rewrite forms_at by auto.
   rewrite form_plus, !form_times, form_plus, form_squares, form_lifted, forms_w, Q2R_sum, Q2R_opp1 by auto.
-  rewrite <- mean_spread.
+  pose proof (mean_spread d (chances f) (mixed f s P) (next_forms f x s) (at_ w st) G) as M.
   unfold eta_forms. rewrite (h_eta _ _ rplus rtimes Rplus times) by (intros; first [apply val_plus | apply val_times]).
   rewrite forms_st by auto.
-  rewrite (mean_ext _ _ (fun o => sum (map (fun t => Q2R (entry s t (Pi f) 0%Q) * V x P t (next f o s st w)) (seq 0 (modes f))))); [lra|].
+  rewrite (mean_ext _ _ (fun o => sum (map (fun t => Q2R (entry s t (Pi f) 0%Q) * V x P t (next f o s st w)) (seq 0 (modes f)))))
+    in M; [lra|].
   intro o. rewrite form_next, form_mixed by auto. reflexivity.
 Qed.
 Lemma form_18 : forall f g x here w st, length w = n_w f -> fits f st ->
@@ -539,7 +685,7 @@ Qed.
 Lemma zero_app : forall a b, zero (a ++ b) <-> zero a /\ zero b.
 Proof. intros. apply Forall_app. Qed.
 Lemma positive_at : forall f x X w st, positive (order f x) X = true -> length w = n_w f -> fits f st ->
-  0 <= formQ X (at_ w st) /\ (~ zero (w ++ etaR x st) -> 0 < formQ X (at_ w st)).
+  exists d, 0 <= formQ (X d) (at_ w st) /\ (~ zero (w ++ etaR x st) -> 0 < formQ (X d) (at_ w st)).
 Proof.
   intros f x X w st P L F. destruct (fits_errors f st F) as [E N].
   assert (S : exists v u, at_ w st = v ++ u /\ length v = order f x /\ (zero v -> zero (w ++ etaR x st))).
@@ -549,19 +695,13 @@ Proof.
       rewrite !zero_app. tauto.
     - exists (w ++ concat (errorsR st)), (fst st). rewrite app_assoc, app_length, C, L. split; [reflexivity|]. split; [lia|].
       intro Z; exact Z. }
-  destruct S as [v [u [-> [K Z]]]]. destruct (zero_or v) as [O|O].
-  - split; [|tauto]. apply andb_true_iff in P as [W _]. rewrite (form_within X (order f x)) by auto.
-    unfold formQ. rewrite form_zero by auto. lra.
-  - pose proof (positive_ok _ _ v u P K O). split; [lra | auto].
+  destruct S as [v [u [-> [K Z]]]]. apply positive_ok in P as [d [W P]]. exists d. destruct (zero_or v) as [O|O].
+  - split; [|tauto]. rewrite (form_within (X d) (order f x)) by auto. unfold formQ. rewrite form_zero by auto. lra.
+  - specialize (P v u K O). split; [lra | auto].
 Qed.
 
 Lemma nil_eqb : forall (f : network) s, (s < modes f)%nat -> In (nth s (Pi f) []) (Pi f).
 Proof. intros. apply nth_In. assumption. Qed.
-Lemma probable_ok : forall p, probable p = true -> 0 <= Q2R p <= 1.
-Proof.
-  intros p P. apply andb_true_iff in P as [A B]. apply Qle_bool_iff, Qle_Rle in A. apply Qle_bool_iff, Qle_Rle in B.
-  rewrite Q2R_0 in A. rewrite Q2R_1 in B. auto.
-Qed.
 Lemma proper_chances : forall f, proper f = true -> forallb probable (chances f) = true /\
   forallb (forallb probable) (Pi f) = true /\ forallb (fun row => negb (Qeq_bool (fold_right Qplus 0%Q row) 0)) (Pi f) = true.
 Proof. intros f P. unfold proper in P. cbv zeta in P. rewrite !andb_true_iff in P. tauto. Qed.
@@ -615,19 +755,20 @@ Proof.
   intros. unfold fits, next, step, sized. simpl. rewrite !map_length, !seq_length. repeat split.
   rewrite Forall_map, Forall_forall. intros. now rewrite map_length, seq_length.
 Qed.
-Lemma all_ok : forall f ok s, all f ok = true -> (s < modes f)%nat -> ok s = true.
-Proof. intros f ok s A S. unfold all in A. rewrite forallb_forall in A. apply A, in_seq. lia. Qed.
-Lemma decide_17_ok : forall f x here P s st w, proper f = true -> decide_17 f x here P = true -> (s < modes f)%nat -> fits f st ->
+Lemma all_ok : forall f ok s, every f ok = true -> (s < modes f)%nat -> ok s = true.
+Proof. intros f ok s A S. unfold every in A. rewrite forallb_forall in A. apply A, in_seq. lia. Qed.
+Lemma decide_17_ok : forall f x here P s st w, proper f = true -> decide_17 f x (all_forms f x) here P = true -> (s < modes f)%nat -> fits f st ->
   length w = n_w f -> let E := expected f s (fun o t => V x P t (next f o s st w)) in
   E <= norm2 w + V x here s st /\ (~ zero (w ++ etaR x st) -> E < norm2 w + V x here s st).
 Proof.
   intros f x here P s st w R D S F L E. pose proof (all_ok f _ s D S) as A. simpl in A.
-  pose proof (positive_at f x _ w st A L F) as N. rewrite form_17 in N by auto.
+  destruct (positive_at f x _ w st A L F) as [d N].
+  pose proof (form_17 f x s (nth s here []) P d w st (proj1 (proper_chances f R)) S L F) as M.
   assert (G : total f s * E = mean (chances f)
     (fun o => sum (map (fun t => Q2R (entry s t (Pi f) 0%Q) * V x P t (next f o s st w)) (seq 0 (modes f))))).
   { unfold E, expected. rewrite <- mean_times. apply mean_ext. intro o. unfold switched.
     pose proof (total_pos f s R S) as T. unfold total in *. field. lra. }
-  rewrite <- G in N. change (formQ (nth s here []) (etaR x st)) with (V x here s st) in N.
+  rewrite <- G in M. change (formQ (nth s here []) (etaR x st)) with (V x here s st) in M.
   pose proof (total_pos f s R S). destruct N as [N1 N2]. split; [nra|]. intro Z. specialize (N2 Z). nra.
 Qed.
 Lemma squares_pos : forall f w st, length w = n_w f -> formQ (squares (w_forms f)) (at_ w st) = norm2 w.
@@ -639,7 +780,7 @@ Proof.
   intros f g x P s st D S F G. pose proof (all_ok f _ s D S) as A. simpl in A.
   set (w := repeat 0 (n_w f)). assert (L : length w = n_w f) by apply repeat_length.
   assert (N0 : norm2 w = 0) by (unfold w; generalize (n_w f); induction n; [reflexivity|]; simpl; rewrite norm2_cons, IHn; lra).
-  pose proof (positive_at f x _ w st A L F) as N. rewrite form_plus, form_squares, forms_w, form_18, N0 in N by auto.
+  destruct (positive_at f x _ w st A L F) as [d N]. rewrite form_plus, form_squares, forms_w, form_18, N0 in N by auto.
   change (formQ (nth s P []) (etaR x st)) with (V x P s st) in N. fold G in N.
   destruct N as [N1 N2]. split; [lra|]. intro Z. assert (~ zero (w ++ etaR x st)) by (rewrite zero_app; tauto). specialize (N2 H). lra.
 Qed.
@@ -654,7 +795,7 @@ Qed.
 
 Definition covers f g x k (P : list matrix) := forall s st w, (s < modes f)%nat -> fits f st ->
   peak f k s st w <= Q2R g * Q2R g * (energy f k s w + V x P s st).
-Lemma covers_next : forall f g x k here P, proper f = true -> decide_17 f x here P = true -> covers f g x k P -> covers f g x (S k) here.
+Lemma covers_next : forall f g x k here P, proper f = true -> decide_17 f x (all_forms f x) here P = true -> covers f g x k P -> covers f g x (S k) here.
 Proof.
   intros f g x k here P OK D C s st [w p] S F. cbn [peak energy fst snd].
   set (w' := sized R 0 (n_w f) w). assert (L : length w' = n_w f) by (unfold w', sized; now rewrite map_length, seq_length).
@@ -664,13 +805,13 @@ Proof.
   rewrite (expected_ext _ _ _ (fun o t => energy f k t (p o t) + 1 * V x P t (next f o s st w'))) by (intros; ring).
   rewrite expected_line. pose proof (Rle_0_sqr (Q2R g)) as G. unfold Rsqr in G. apply Rmult_le_compat_l; auto. lra.
 Qed.
-Lemma covers_all : forall f g x levels k, proper f = true -> chain f x levels = true -> covers f g x k (hd [] levels) ->
+Lemma covers_all : forall f g x levels k, proper f = true -> chain f x (all_forms f x) levels = true -> covers f g x k (hd [] levels) ->
   forall j, exists P, covers f g x (k + j) P.
 Proof.
   intros f g x levels. induction levels as [|P below IH]; intros k OK C B j; [discriminate|]. simpl in C, B.
   destruct below as [|P' below].
   - exists P. induction j as [|j IHj]; [now rewrite Nat.add_0_r|]. rewrite Nat.add_succ_r. apply (covers_next f g x _ P P); auto.
-  - apply andb_true_iff in C as [D C]. destruct j as [|j]; [exists P; now rewrite Nat.add_0_r|].
+  - destruct (decide_17 f x (all_forms f x) P' P) eqn:D; [|discriminate]. destruct j as [|j]; [exists P; now rewrite Nat.add_0_r|].
     replace (k + S j)%nat with (S k + j)%nat by lia. apply IH; auto. apply (covers_next f g x k P' P); auto.
 Qed.
 
