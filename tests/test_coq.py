@@ -62,7 +62,7 @@ def test_steps_of_the_recursion_are_not_believed(folder: Path) -> None:
     file = read("full")
     del file["certificate"]["theorem1_gamma"]
     text, (low, _) = TOOL["certificate"](file), file["certificate"]["exact"]
-    (claimed,) = re.findall(r"gamma_1 := (.*)\.\n", text)
+    (claimed,) = re.findall(r"gamma_1 := (\S+)\. ", text)
     assert not accepted(folder, text.replace(f"gamma_1 := {claimed}", f"gamma_1 := {TOOL['number'](low)}"))
 
 
@@ -106,3 +106,22 @@ def test_of_what_cannot_be_read_coq_is_not_asked(
     assert TOOL["main"]() == 2
     assert f"Coq was not asked: {why}" in capsys.readouterr().out
     assert not (tmp_path / "coq").exists()
+
+
+def test_without_coq_it_is_said_which_package_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(
+        "sys.argv", ["coq_certificate.py", str(CORRECT / "full.json"), str(tmp_path / "coq"), "theorem1"]
+    )
+    assert TOOL["main"]() == 2
+    assert "Debian's package is coq" in capsys.readouterr().out
+    assert not (tmp_path / "coq").exists()
+
+
+def test_theorem1_leaves_out_what_only_the_recursion_proves() -> None:
+    text = TOOL["certificate"](read("full"), with_recursion=False)
+    assert re.findall(r"Theorem (\w+)", text) == ["bound_1", "inequalities_1"]
+    with pytest.raises(AssertionError, match="prove no gamma"):
+        TOOL["certificate"](read("links"), with_recursion=False)
