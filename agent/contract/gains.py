@@ -203,7 +203,7 @@ class Gains(Model):
 
     def __repr__(self) -> str:
         """In a line; `document()` has everything."""
-        claim = "certified" if self.certificate.holds else "not certified"
+        claim = "claimed" if self.certificate.holds else "not claimed"
         return f"Gains({self.problem.name} by {self.method}: gamma = {self.gamma:.6g}, {claim})"
 
     __str__ = __repr__

@@ -51,10 +51,6 @@ class Stability(NamedTuple):
     holds: bool | None
     arithmetic: str
 
-    @property
-    def word(self) -> str:
-        return {True: "proved", False: "proved false", None: "not known"}[self.holds]
-
 
 class Prover:
     """P (modes, n_eta, n_eta), of which (P + P')/2 counts; without one, it is found here. `makes`: whom to ask.

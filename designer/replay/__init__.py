@@ -365,6 +365,7 @@ def _verdict(log: Log, tally: Tally, compared: _Compared) -> Verdict:
         chance=_chance(log, gamma, ledger, compared.energy),
         pacing=compared.pacing,
         path_margin=audit.margin if audit and audit.step >= 0 else None,
+        silent_from=audit.silent_from if audit and audit.silent else None,
         leeway=None if np.isnan(tally.leeway) else tally.leeway,
         up_to=tally.last,
     )

@@ -160,6 +160,7 @@ class Verdict:
     chance: Chance | None  # what single runs keep; None where gamma is not proved, or says less of this run
     ledger: Account | None  # what gamma says of this run; None where it is not proved
     path_margin: float | None  # smallest 1 - |z_tilde(k)| / bound of proof 5 that is not trivial
+    silent_from: int | None  # the first step of which proof 5 says nothing, because of rounding
     leeway: float | None  # the tolerance in units of the estimates, at the last step
     up_to: int | None  # the last step that was compared, where later ones have numbers too large for that
 
@@ -249,6 +250,7 @@ class Verdict:
             "one_run": self.chance.document() if self.chance else None,
             "ledger": self.ledger.document() if self.ledger else None,
             "path_margin": self.path_margin,
+            "silent_from": self.silent_from,
             "proofs": [vars(proof) for proof in self.proofs],
         }
 
@@ -274,11 +276,11 @@ class Verdict:
             return f"{answer}: " + ("it holds nothing to compare" if self.agrees else "its bytes were changed later")
         if self.outcome == "diverges" and all(proof.holds is not False for proof in self.proofs if proof.number != 4):
             return f"{answer}: every number in it agrees, but {self._what_is_wrong()}"
-        return (
-            answer
-            if self.up_to is None
-            else f"{answer} up to step {self.up_to}: later numbers are too large to compare"
-        )
+        if self.up_to is None:
+            return answer
+        if self.outcome == "agrees":
+            return f"{answer} up to step {self.up_to}: later numbers are too large to compare"
+        return f"{answer}; numbers after step {self.up_to} are too large to compare"
 
     def _what_is_wrong(self) -> str:
         """The faults of proof 4 in a few words."""
@@ -363,7 +365,10 @@ class Verdict:
         if self.peak is not None:
             bound = "" if self.energy is None or not self.gamma.is_claimed else self._bound(self.energy)
             against = " against the simulated plant" if self.external else ""
-            lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}")
+            rounding = ""
+            if self.silent_from is not None and self.peak.step >= self.silent_from:
+                rounding = f"; from step {self.silent_from} on it may be rounding alone"
+            lines.append(f"peak |z~| {self.peak.size:.4g}{against} at step {self.peak.step}{bound}{rounding}")
         lines += [self.gamma.text(), *([self.chance.text()] if self.chance else [])]
         return [*lines, *([f"ledger       {self.ledger.text()}"] if self.ledger else [])]
 

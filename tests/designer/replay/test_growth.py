@@ -72,11 +72,15 @@ def test_a_state_that_grows_silences_the_path_inequality(tmp_path: Path) -> None
     short = replayed(tmp_path, growing(1.2), 40)
     assert outcome(short, 5) is True
     assert "says nothing" not in short.text()
+    assert short.silent_from is None
+    assert "rounding alone" not in short.text().split("peak")[1]
     (tmp_path / "run.mcap").unlink()
     verdict = replayed(tmp_path, growing(1.2), 400)
     assert verdict.agrees, verdict.text()
     note = next(proof.note for proof in verdict.proofs if proof.number == 5)
-    assert "it says nothing from step " in note
+    assert f"it says nothing from step {verdict.silent_from} on" in note
+    assert verdict.peak is not None
+    assert (" on it may be rounding alone" in verdict.text()) is (verdict.peak.step >= (verdict.silent_from or 0))
     assert verdict.path_margin is not None
     assert verdict.leeway is not None
     assert verdict.leeway > 1e10
@@ -118,7 +122,7 @@ def test_a_number_that_growth_does_not_explain_is_strange(tmp_path: Path) -> Non
 
 def test_a_lie_before_the_numbers_are_too_large_is_found(tmp_path: Path) -> None:
     verdict = replayed(tmp_path, growing(3.0), 400, nudge=(10, "a", 1.0))
-    assert not verdict.agrees
+    assert verdict.headline() == f"DIVERGES; numbers after step {verdict.up_to} are too large to compare"
     assert verdict.first_divergence is not None
     assert verdict.first_divergence.step == 10
 
