@@ -70,7 +70,7 @@ def sweep_command(options: argparse.Namespace) -> int:
 
 
 def _draw(over: Range, points: Sequence[Point], options: argparse.Namespace) -> list[Path]:
-    """What is certified beside what there was to reach, and beside what no gains undercut by an LMI, where that is proved."""
+    """What is certified beside what there was to reach, and what is proved that no gains are below by an LMI."""
     from designer.report import figures
     from designer.report.curves import curve
 
