@@ -37,7 +37,8 @@ class Point(NamedTuple):
     gamma: float | None  # certified
     exact: float | None  # the upper end of the exact gain
     floor: float | None
-    theorem2: float | None  # the LMI's bound, where it was solved
+    theorem2: float | None  # the LMI's bound, where it was solved, as a solver gave it
+    theorem2_least: float | None  # proved: no gains have less by the LMI
     seconds: float | None
     reason: str | None
 
@@ -127,11 +128,20 @@ def _designed(job: _Job) -> Point:
     try:
         gains = design(job.problem, method=job.method, budget=job.budget)
     except Unattainable as error:
-        return Point(job.value, None, None, None, None, None, str(error))
+        return Point(job.value, None, None, None, None, None, None, str(error))
     if gains.solver.status.startswith("interrupted"):  # the best gains so far are no point of the curve
         raise KeyboardInterrupt
     ladder = ladder_of(gains)
     exact = None if ladder.exact is None else ladder.exact[1]
     is_cut = gains.solver.status.startswith("out of time")
     unfinished = "the search was out of time; --budget gives it more" if is_cut else None
-    return Point(job.value, ladder.gamma, exact, ladder.floor, ladder.theorem2, gains.seconds["total"], unfinished)
+    return Point(
+        job.value,
+        ladder.gamma,
+        exact,
+        ladder.floor,
+        ladder.theorem2,
+        ladder.theorem2_least,
+        gains.seconds["total"],
+        unfinished,
+    )

@@ -70,11 +70,11 @@ def sweep_command(options: argparse.Namespace) -> int:
 
 
 def _draw(over: Range, points: Sequence[Point], options: argparse.Namespace) -> list[Path]:
-    """What is certified beside what there was to reach, and Theorem 2's bound where it is known."""
+    """What is certified beside what there was to reach, and what is proved that no gains are below by an LMI."""
     from designer.report import figures
     from designer.report.curves import curve
 
-    series = {"certified": "gamma", "floor": "floor", "Theorem 2's bound": "theorem2"}
+    series = {"certified": "gamma", "floor": "floor", "least by the LMI": "theorem2_least"}
     found = {name: [getattr(point, field) for point in points] for name, field in series.items()}
     draw = {NAME: lambda width: curve(over.key, over.values, found, width)}
     return figures.write(draw, options.figures, kind=options.format or FORMATS[0], force=options.force)
