@@ -16,6 +16,7 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.decay import Decay, decay
+from designer.gain.alone import Alone
 from designer.gain.products import Collected, Pattern, Products
 from designer.invariants import Threshold, invariants, scaled
 from designer.model.error_model import ErrorModel
@@ -33,9 +34,10 @@ _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
 
 
 class Gain(NamedTuple):
-    """gamma lies in [low, high]: at low^2 the recursion fails within `horizon` steps, at high^2 it never does.
+    """gamma lies in [low, high]: at low^2 the recursion is known to fail by `horizon` steps, at high^2 it never does.
 
-    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None.
+    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None. Where
+    chance has no say there is no recursion to end, and no P either.
     """
 
     low: float
@@ -246,6 +248,9 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
 
     None: 1e-6, of large networks 1e-4.
     """
+    alone = Alone.of(model)
+    if alone is not None:
+        return Gain(*alone.gain(model.M), alone.horizon(model.M), None, alone.radius)
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
@@ -266,6 +271,9 @@ def node_gains(model: ErrorModel, *, most: float = math.inf) -> list[tuple[float
     M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable, or
     more work than `most`: numbers of Y for every node, as many times as errors take steps to decay.
     """
+    alone, of_nodes = Alone.of(model), np.split(model.M, len(model.rows))
+    if alone is not None:
+        return [alone.gain(M) for M in of_nodes]
     operator = Operator(model)
     work = len(model.rows) * operator.MM.size
     if work > most:
@@ -277,7 +285,7 @@ def node_gains(model: ErrorModel, *, most: float = math.inf) -> list[tuple[float
     if not invariant.P:
         return None
     found = []
-    for M in np.split(model.M, len(model.rows)):
+    for M in of_nodes:
         operator.MM = np.broadcast_to(M.T @ M, operator.MM.shape)
         bracket = _bracket(operator, _MOST_STEPS, invariant, _WIDTH_OF_NODES)
         found.append((math.sqrt(bracket.low), math.sqrt(bracket.high)))

@@ -16,6 +16,7 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
+from designer.proof.by_gramian import ByGramian
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
 from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_leaps, recursion
 from designer.proof.undisturbed import Starts, largest
@@ -89,6 +90,11 @@ class Prover:
         return self._floats.model.invariants if self._given is None else [self._given]
 
     @cached_property
+    def by_gramian(self) -> ByGramian | None:
+        """Where chance has no say, and nobody says by which P; it knows at once what the recursion comes to."""
+        return ByGramian.of(self._problem, self._K, self._H) if self._given is None else None
+
+    @cached_property
     def _floats(self) -> ByFloats:
         return ByFloats(self._problem, self._K, self._H, T=self.T)
 
@@ -102,6 +108,10 @@ class Prover:
 
     def exact(self, gamma: float, *, most: int = MOST_STEPS) -> Verdict:
         """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
+        if self.by_gramian is not None:
+            modes, sign = self._problem.mode_names, self.by_gramian.sign(gamma)
+            finding = found("M G M' < g", modes, [sign] * len(modes))
+            return _verdict(gamma, [_Answer(finding, self.by_gramian.name)])
         if self.P is None:
             return self._no_P(gamma)
         for P in reversed(self._invariants[1:]):
@@ -128,6 +138,8 @@ class Prover:
 
         Of errors that decay slowly the steps that take long are made last.
         """
+        if self.by_gramian is not None:
+            return self.by_gramian.name if self.by_gramian.sign(gamma).refuted else None
         if most <= _STEPS_BEFORE_LEAPS:
             return self.at_least_by_steps(gamma, most=most)
         return (
@@ -176,6 +188,8 @@ class Prover:
     @cached_property
     def stable(self) -> Stability:
         """By (17) and P > 0, or else by Z of `designer.decay`: Z - L(Z) > 0, and Z > 0 or some v'Z(s)v < 0."""
+        if self.by_gramian is not None and self.by_gramian.dies_out:
+            return Stability(True, self.by_gramian.name)
         if self.P is not None and all(proved(answer.findings) for answer in self._stability):
             return Stability(True, self._stability[0].arithmetic)
         Z, modes = self._floats.model.decay.total, self._problem.mode_names
