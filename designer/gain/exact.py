@@ -18,11 +18,12 @@ from agent.contract.arrays import Array
 from designer.decay import Decay, decay
 from designer.gain.alone import Alone
 from designer.gain.products import Collected, Pattern, Products
-from designer.invariants import Threshold, invariants, scaled
+from designer.invariants import Invariants, Outweighed, Threshold, invariants, scaled
 from designer.model.error_model import ErrorModel
 from designer.model.links import LinkTerms
 from designer.model.units import natural_scale
 from designer.patience import look
+from designer.steered import Steered
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _WIDTH_OF_LARGE = 1e-4  # where a sweep takes 10 s and more, and one that holds near gamma several times as many steps
@@ -180,8 +181,14 @@ class InvariantSet:
     a larger W. Of several P, each has its set.
     """
 
-    def __init__(self, *P: Array, thresholds: Sequence[Threshold] = ()) -> None:
+    def __init__(self, *P: Array, thresholds: Sequence[Threshold | Outweighed] = ()) -> None:
         self.P, self.thresholds = P, thresholds  # each P (modes, n_eta, n_eta)
+
+    @classmethod
+    def of(cls, known: Invariants) -> InvariantSet:
+        """All that is known."""
+        of_x = [] if known.of_x is None else [known.of_x]
+        return cls(*known.P, *(each.P for each in of_x), thresholds=[*of_x, *known.thresholds])
 
     def contains(self, Y: Array, g: float) -> bool:
         """Cholesky decides."""
@@ -238,8 +245,10 @@ def invariant_set(operator: Operator, decays: Decay | None = None) -> InvariantS
     """In which recursions end; without P where floats find none. `decays`: of this operator, where it is known."""
     if decays is None:
         decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
-    P, thresholds = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
-    return InvariantSet(*P, thresholds=thresholds)
+    model, p = operator.model, operator.p
+    steered = Steered(model.A[0, :p, :p], model.B[0, :p]) if p else None
+    known = invariants(operator.of, decays, operator.units, np.asarray(operator.MM), steered)
+    return InvariantSet.of(known)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable

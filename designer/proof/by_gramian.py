@@ -18,10 +18,9 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.proof.ball_model import BallModel, is_zero
 from designer.proof.balls import UNDECIDED, Sign, diagonal, identity, part, sign
+from designer.proof.gramian import Gramian, square
 
 _BITS = (512, 2048)
-_DOUBLINGS = 80
-_SETTLED = 1e-40  # of the square of A^T
 _LARGEST = 100  # states: to square them takes a tenth of a second
 
 
@@ -102,21 +101,11 @@ class ByGramian:
 
     @cached_property
     def _sum(self) -> tuple[arb_mat, arb] | None:
-        """M G_T M', and what G - G_T adds to its eigenvalues at most; None where A^T is not seen to go to 0.
-
-        G = G_T + A^T G A'^T, so with q = |A^T|^2 < 1 the rest is at most |M|^2 |G_T| q / (1 - q).
-        """
+        """M G_T M', and what is left out of it at most; None where A^k is not seen to go to 0."""
         A, B, M = self._alone
         with ctx.workprec(self._bits):
-            G, power = B * B.transpose(), A
-            for _ in range(_DOUBLINGS):
-                q = _square(power)
-                if q < _SETTLED:
-                    return M * G * M.transpose(), _square(M) * q / (1 - q) * _square(G).sqrt()
-                G, power = G + power * G * power.transpose(), power * power
-                if not all(entry.is_finite() for entry in power.entries()):
-                    break
-        return None
+            found = Gramian.of(A, B)
+            return None if found is None else (M * found.total * M.transpose(), square(M) * found.rest)
 
 
 def _may_be_alone(problem: Problem, H: LinkMatrices) -> bool:
@@ -125,11 +114,6 @@ def _may_be_alone(problem: Problem, H: LinkMatrices) -> bool:
         return True
     certain = ((problem.beta == 0.0) | (problem.beta == 1.0)).all() and not problem.links
     return bool(certain) and len(problem.topologies) == 1 and problem.n * problem.nx < _LARGEST
-
-
-def _square(matrix: arb_mat) -> arb:
-    """Of Frobenius' norm, which is not below any other of these."""
-    return sum((entry**2 for entry in matrix.entries()), arb(0))
 
 
 def _equal(one: arb_mat, other: arb_mat) -> bool:

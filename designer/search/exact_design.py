@@ -373,6 +373,10 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     prover, slow = Prover(problem, K, H), gain.radius > SLOW
     if prover.by_gramian is not None:
         return next((low for part in _BELOW if prover.at_least(low := gain.low * (1.0 - part))), 0.0)
+    if slow:
+        by_costs = (low for part in _LEAPT if prover.at_least_by_costs(low := gain.low * (1.0 - part)))
+        if (found := next(by_costs, None)) is not None:
+            return found
     if slow and prover.at_least_by_leaps(least := gain.low * (1.0 - _LEAPT[-1])):
         ends = {end * (1.0 - part) for part in _LEAPT for end in (gain.low, gain.high)}
         leapt = sorted((low for low in ends if low > least), reverse=True)

@@ -17,7 +17,7 @@ from agent.contract.problem import Problem
 from designer.gain.alone import Alone
 from designer.gain.exact import Operator, exact_gain, horizon_gain, node_gains
 from designer.model.error_model import error_model, link_gains, stacked_links
-from designer.proof import by_gramian
+from designer.proof import gramian
 from designer.proof.by_gramian import ByGramian
 from designer.proof.prover import Prover
 from designer.search.exact_design import certify
@@ -160,7 +160,7 @@ def test_a_sum_that_is_too_short_proves_no_bound_without_its_rest(monkeypatch: p
     problem, K, H = ignored(with_plant(np.diag([0.9, 0.5]), np.eye(2), np.array([[1.0, 0.0]])))
     weights = float((problem.weights**2).sum())
     true, short = (math.sqrt(weights * (1.0 - 0.81**steps) / 0.19) for steps in (1000, 4))
-    monkeypatch.setattr(by_gramian, "_SETTLED", 0.5)
+    monkeypatch.setattr(gramian, "_SETTLED", 0.5)
     proof = ByGramian.of(problem, K, H)
     assert proof is not None
     assert not proof.sign(true).proved
