@@ -96,7 +96,7 @@ def invariants(S: Map, found: Decay, units: Array, peak: Array, steered: Steered
         return Invariants([first], [], of_x)
     written = _Written(S, modes, units)
     thresholds = written.reached().thresholds(found.radius)
-    largest = [written.of(written.added(each.P), _FLOOR) for each in thresholds] or [written.by_rounds(first)]
+    largest = [written.grown(each.P, _FLOOR) for each in thresholds] or [written.by_rounds(first)]
     offered = [first, written.of(peak, _FLOOR), *largest]
     return Invariants([P for P in offered if P is not None], thresholds, of_x)
 
@@ -185,16 +185,19 @@ class _Written:
         rest = Z - self.S(Z)[:, :n, :n]
         return scaled(self.S, Z, rest, _STRICT_WHERE_SLOW) if is_positive(Z) and is_positive(rest) else None
 
-    def added(self, P: Array) -> Array:
-        """A'P_bar B W^-1 B'P_bar A."""
-        grown, n = self.S(P), self.n
-        AB, W = grown[:, :n, n:], np.eye(grown.shape[1] - n) - grown[:, n:, n:]
-        return np.asarray(AB @ np.linalg.solve(W, AB.swapaxes(1, 2)))
+    def grown(self, P: Array, share: float) -> Array | None:
+        """`of` what the worst w adds to P in a step, A'P_bar B W^-1 B'P_bar A; None where W is singular to floats."""
+        joint, n = self.S(P), self.n
+        AB, W = joint[:, :n, n:], np.eye(joint.shape[1] - n) - joint[:, n:, n:]
+        try:
+            return self.of(np.asarray(AB @ np.linalg.solve(W, AB.swapaxes(1, 2))), share)
+        except np.linalg.LinAlgError:
+            return None
 
     def by_rounds(self, P: Array) -> Array:
         """The largest P along one direction, from any."""
         for k in range(2, 2 + _ROUNDS):
-            following = self.of(self.added(P), max(10.0**-k, _FLOOR))
+            following = self.grown(P, max(10.0**-k, _FLOOR))
             if following is None:
                 break
             P = following

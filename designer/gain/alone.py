@@ -19,7 +19,8 @@ _HUGE = 1e100
 _WIDTH = 1e-9
 _LEAST = 1e-150  # an error that is always 0 has a bound above that
 _MOST_STEPS = 128
-_ROUNDING = float(np.finfo(float).eps)
+_LONG = np.longdouble  # what is squared some thirty times loses ten digits
+_ROUNDING = float(np.finfo(_LONG).eps)
 
 
 class Alone(NamedTuple):
@@ -45,7 +46,8 @@ class Alone(NamedTuple):
         copies = model.size // nx
         if np.array_equal(A, np.kron(np.eye(copies), A[:nx, :nx])) and np.array_equal(B, np.tile(B[:nx], (copies, 1))):
             A, B = A[:nx, :nx], B[:nx]
-        sums, power = [B @ B.T], A
+        power, B = A.astype(_LONG), B.astype(_LONG)
+        sums = [B @ B.T]
         for _ in range(_DOUBLINGS):
             if np.abs(power).max() < _SETTLED:
                 return cls(A, sums, model.size // len(A))
@@ -74,6 +76,7 @@ class Alone(NamedTuple):
         )
 
     def _gain_of(self, total: Array, M: Array) -> float:
-        folded = M.reshape(len(M), self.copies, -1).sum(axis=1)
-        largest = float(np.linalg.eigvalsh(folded @ (total + total.T) @ folded.T / 2.0).max())
+        folded = M.astype(_LONG).reshape(len(M), self.copies, -1).sum(axis=1)
+        weighed = (folded @ (total + total.T) @ folded.T / 2.0).astype(np.float64)
+        largest = float(np.linalg.eigvalsh(weighed).max()) if np.isfinite(weighed).all() else math.inf
         return math.sqrt(max(largest, 0.0))

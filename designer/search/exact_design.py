@@ -16,6 +16,7 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
+from designer.gain.alone import Alone
 from designer.gain.exact import (
     Gain,
     InvariantSet,
@@ -342,9 +343,13 @@ def certify(
 def certify_at_once(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
     """A gamma that a recursion of few steps proves; or Unattainable.
 
-    Where errors decay slowly it is above the exact gain, of which nothing is said.
+    Where errors decay slowly it is above the exact gain, of which nothing is said; but where chance has no say that is
+    known at once.
     """
-    operator = Operator(model_of_gains(problem, K, H))
+    model = model_of_gains(problem, K, H)
+    if Alone.of(model) is not None:
+        return certify(problem, K, H)
+    operator = Operator(model)
     invariant, g = invariant_set(operator), _FIRST_AT_ONCE * horizon_gain(operator, 1)[1]
     while invariant.P and g < _HIGHEST and not recursion_holds(operator, g, _STEPS_AT_ONCE, invariant=invariant).holds:
         g *= _GROWTH_AT_ONCE
