@@ -15,10 +15,12 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.decay import DENSE, Decay, Map, is_positive, packing
+from designer.steered import Steered
 
 _STRICT = 1e-3  # by this part of itself P stands below the largest multiple that satisfies (17)
 _STRICT_WHERE_SLOW = 1e-6
 _SLOW = 0.98  # radius from which on one P would end the recursion late
+_STEPS_OF_ERRORS = 300
 _ROUNDS = 8
 _FLOOR = 1e-6  # of I that is in every U, so that P > 0
 _ALL_SLOW, _AS_SLOW = 0.99, (1.05, 3.0)  # |eigenvalues| of L that count as slow; 1 - |.| beside 1 - radius
@@ -53,31 +55,59 @@ class Threshold(NamedTuple):
         return any(X.max() > max(_BEYOND * border, _RESOLVED * -X.min()) for X in ends)
 
 
+class Outweighed(NamedTuple):
+    """Where Y weighs what w alone steers by more than it costs, whatever errors there are; `strict` satisfies (17)."""
+
+    steered: Steered
+    strict: Array
+    P: Array  # in whose invariant set the recursion ends early; (17) is nearly an equality for it
+
+    def passed(self, Y: Array, g: float) -> bool:
+        """Whether that is so, as far as floats tell; then no bound is below sqrt g."""
+        return bool(np.isfinite(Y).all()) and self.steered.direction(Y, self.strict, g) is not None
+
+
 class Invariants(NamedTuple):
     """Every P satisfies (17) strictly, as far as floats tell; none: the errors do not die out, or it is not known."""
 
     P: list[Array]
     thresholds: list[Threshold]  # empty where errors decay fast, or none was found
+    of_x: Outweighed | None = None  # where x decays slowly
 
 
-def invariants(S: Map, found: Decay, units: Array, peak: Array) -> Invariants:
+def invariants(S: Map, found: Decay, units: Array, peak: Array, steered: Steered | None = None) -> Invariants:
     """S(Y) is (modes, n + nw, n + nw), L its corner, peak M'M, units those of natural size.
 
-    The first P is of Z. Where errors decay slowly there are more, of other U: M'M, which suits errors that all move
-    alike; and A'P_bar B W^-1 B'P_bar A, what the worst w adds at each threshold, that of most errors last; or where
-    none is found, taken again and again, until P is as large as can be in the direction that lasts.
+    The first P is of Z. Where errors decay slowly there are more: of what is `steered`, which is all that is needed
+    if the rest decays fast; and of other U: M'M, which suits errors that all move alike; and A'P_bar B W^-1 B'P_bar A,
+    what the worst w adds at each threshold, that of most errors last; or where none is found, taken again and again,
+    until P is as large as can be in the direction that lasts.
     """
     if found.total is None or found.rest is None or not found.dies_out:
         return Invariants([], [])
     modes, n = found.total.shape[:2]
     first = scaled(S, found.total, found.rest)
-    if modes * n * (n + 1) // 2 > DENSE or found.radius < _SLOW:
+    if found.radius < _SLOW:
         return Invariants([first], [])
+    of_x = None
+    if steered is not None and steered.known:
+        of_x = Outweighed(steered, first, steered.P(first))
+    if modes * n * (n + 1) // 2 > DENSE or (of_x is not None and not _lasts(S, modes, n, of_x.steered.size)):
+        return Invariants([first], [], of_x)
     written = _Written(S, modes, units)
     thresholds = written.reached().thresholds(found.radius)
-    largest = [written.of(written.added(each.P), _FLOOR) for each in thresholds] or [written.by_rounds(first)]
+    largest = [written.grown(each.P, _FLOOR) for each in thresholds] or [written.by_rounds(first)]
     offered = [first, written.of(peak, _FLOOR), *largest]
-    return Invariants([P for P in offered if P is not None], thresholds)
+    return Invariants([P for P in offered if P is not None], thresholds, of_x)
+
+
+def _lasts(S: Map, modes: int, n: int, p: int) -> bool:
+    """Whether errors last as well as the first p states, which none of them moves."""
+    Y = np.zeros((modes, n, n))
+    Y[:, p:, p:] = np.eye(n - p)
+    for _ in range(_STEPS_OF_ERRORS):
+        Y[:, p:, p:] = S(Y)[:, p:n, p:n]
+    return not np.abs(Y).max() < _SLOW**_STEPS_OF_ERRORS
 
 
 def scaled(S: Map, Z: Array, rest: Array, strict: float = _STRICT) -> Array:
@@ -155,16 +185,19 @@ class _Written:
         rest = Z - self.S(Z)[:, :n, :n]
         return scaled(self.S, Z, rest, _STRICT_WHERE_SLOW) if is_positive(Z) and is_positive(rest) else None
 
-    def added(self, P: Array) -> Array:
-        """A'P_bar B W^-1 B'P_bar A."""
-        grown, n = self.S(P), self.n
-        AB, W = grown[:, :n, n:], np.eye(grown.shape[1] - n) - grown[:, n:, n:]
-        return np.asarray(AB @ np.linalg.solve(W, AB.swapaxes(1, 2)))
+    def grown(self, P: Array, share: float) -> Array | None:
+        """`of` what the worst w adds to P in a step, A'P_bar B W^-1 B'P_bar A; None where W is singular to floats."""
+        joint, n = self.S(P), self.n
+        AB, W = joint[:, :n, n:], np.eye(joint.shape[1] - n) - joint[:, n:, n:]
+        try:
+            return self.of(np.asarray(AB @ np.linalg.solve(W, AB.swapaxes(1, 2))), share)
+        except np.linalg.LinAlgError:
+            return None
 
     def by_rounds(self, P: Array) -> Array:
         """The largest P along one direction, from any."""
         for k in range(2, 2 + _ROUNDS):
-            following = self.of(self.added(P), max(10.0**-k, _FLOOR))
+            following = self.grown(P, max(10.0**-k, _FLOOR))
             if following is None:
                 break
             P = following

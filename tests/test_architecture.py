@@ -51,10 +51,12 @@ ROOMS = {
     "designer.patience": "",
     "designer.coordinates": "",
     "designer.decay": "",
-    "designer.invariants": "designer.decay",
+    "designer.steered": "",
+    "designer.invariants": "designer.decay designer.steered",
     "designer.model": "designer.coordinates",
-    "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model designer.patience",
-    "designer.proof": "designer.coordinates designer.decay designer.invariants designer.patience",
+    "designer.gain": "designer.coordinates designer.decay designer.invariants designer.model "
+    "designer.patience designer.steered",
+    "designer.proof": "designer.coordinates designer.decay designer.invariants designer.patience designer.steered",
     "designer.lmi": "designer.gain designer.model designer.patience designer.proof",
     "designer.workers": "designer.patience",
     "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "

@@ -16,12 +16,14 @@ import numpy as np
 
 from agent.contract.arrays import Array
 from designer.decay import Decay, decay
+from designer.gain.alone import Alone
 from designer.gain.products import Collected, Pattern, Products
-from designer.invariants import Threshold, invariants, scaled
+from designer.invariants import Invariants, Outweighed, Threshold, invariants, scaled
 from designer.model.error_model import ErrorModel
 from designer.model.links import LinkTerms
 from designer.model.units import natural_scale
 from designer.patience import look
+from designer.steered import Steered
 
 _WIDTH = 1e-6  # relative width of the bracket of gamma^2
 _WIDTH_OF_LARGE = 1e-4  # where a sweep takes 10 s and more, and one that holds near gamma several times as many steps
@@ -33,9 +35,10 @@ _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
 
 
 class Gain(NamedTuple):
-    """gamma lies in [low, high]: at low^2 the recursion fails within `horizon` steps, at high^2 it never does.
+    """gamma lies in [low, high]: at low^2 the recursion is known to fail by `horizon` steps, at high^2 it never does.
 
-    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None.
+    Where the error system is not mean-square stable, no finite bound is proved: high is infinite, P is None. Where
+    chance has no say there is no recursion to end, and no P either.
     """
 
     low: float
@@ -178,8 +181,14 @@ class InvariantSet:
     a larger W. Of several P, each has its set.
     """
 
-    def __init__(self, *P: Array, thresholds: Sequence[Threshold] = ()) -> None:
+    def __init__(self, *P: Array, thresholds: Sequence[Threshold | Outweighed] = ()) -> None:
         self.P, self.thresholds = P, thresholds  # each P (modes, n_eta, n_eta)
+
+    @classmethod
+    def of(cls, known: Invariants) -> InvariantSet:
+        """All that is known."""
+        of_x = [] if known.of_x is None else [known.of_x]
+        return cls(*known.P, *(each.P for each in of_x), thresholds=[*of_x, *known.thresholds])
 
     def contains(self, Y: Array, g: float) -> bool:
         """Cholesky decides."""
@@ -236,8 +245,10 @@ def invariant_set(operator: Operator, decays: Decay | None = None) -> InvariantS
     """In which recursions end; without P where floats find none. `decays`: of this operator, where it is known."""
     if decays is None:
         decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
-    P, thresholds = invariants(operator.of, decays, operator.units, np.asarray(operator.MM))
-    return InvariantSet(*P, thresholds=thresholds)
+    model, p = operator.model, operator.p
+    steered = Steered(model.A[0, :p, :p], model.B[0, :p]) if p else None
+    known = invariants(operator.of, decays, operator.units, np.asarray(operator.MM), steered)
+    return InvariantSet.of(known)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # gains of any size: what overflows is not stable
@@ -246,6 +257,9 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
 
     None: 1e-6, of large networks 1e-4.
     """
+    alone = Alone.of(model)
+    if alone is not None:
+        return Gain(*alone.gain(model.M), alone.horizon(model.M), None, alone.radius)
     np.empty(_FREED)  # glibc keeps blocks up to the largest that was freed: no step waits for the system's memory
     operator = Operator(model)
     decays = decay(operator.corner, len(operator.MM), operator.units, operator.model.moves)
@@ -266,6 +280,9 @@ def node_gains(model: ErrorModel, *, most: float = math.inf) -> list[tuple[float
     M is replaced by the rows of that node; P is of the whole network, since (17) does not know M. None: not stable, or
     more work than `most`: numbers of Y for every node, as many times as errors take steps to decay.
     """
+    alone, of_nodes = Alone.of(model), np.split(model.M, len(model.rows))
+    if alone is not None:
+        return [alone.gain(M) for M in of_nodes]
     operator = Operator(model)
     work = len(model.rows) * operator.MM.size
     if work > most:
@@ -277,7 +294,7 @@ def node_gains(model: ErrorModel, *, most: float = math.inf) -> list[tuple[float
     if not invariant.P:
         return None
     found = []
-    for M in np.split(model.M, len(model.rows)):
+    for M in of_nodes:
         operator.MM = np.broadcast_to(M.T @ M, operator.MM.shape)
         bracket = _bracket(operator, _MOST_STEPS, invariant, _WIDTH_OF_NODES)
         found.append((math.sqrt(bracket.low), math.sqrt(bracket.high)))

@@ -63,6 +63,11 @@ class Noise(NamedTuple):
     carried: arb_mat
     loss: bool
 
+    @property
+    def is_nothing(self) -> bool:
+        """Whether it surely adds nothing: its gains are 0."""
+        return is_zero(self.E) or is_zero(self.C)
+
 
 class Sensor(NamedTuple):
     """What node j measures: its mean innovation bias x + C_mean e_j + D_mean w; a loss takes `lost` [eta; w] from it.
@@ -151,7 +156,7 @@ class BallModel:
         for rows in all_rows:
             for columns in [*blocks, list(range(self.size, matrix.ncols()))]:
                 block = part(matrix, rows, columns)
-                if columns and not _is_zero(block):
+                if columns and not is_zero(block):
                     block = block * right if columns[0] < self.size else block
                     add(turned, rows, columns, block if left is None else left * block)
         return turned
@@ -174,7 +179,7 @@ class BallModel:
         C, real, D = exact(node.C), exact(self.real.C[j]), exact(self.real.D[j])
         beta, c = arb(self.truth.beta[j].item()), arb(node.arrival_probability)
         by_x = (real - C) * beta if node.seen else real * beta - C * c
-        if not self.x and not _is_zero(by_x):
+        if not self.x and not is_zero(by_x):
             raise ValueError(f'node "{node.name}" measures x, or loses it unseen, as its filter does not know')
         columns, lost = self.x, real
         if node.seen:
@@ -182,9 +187,9 @@ class BallModel:
             columns, lost = self.e[j] + self.w, arb_mat(ny, nx + problem.nw)
             add(lost, range(ny), range(nx), C)
             add(lost, range(ny), range(nx, nx + problem.nw), D)
-            if not _is_zero(real - C):
+            if not is_zero(real - C):
                 columns, lost = self.x + columns, _beside(real - C, lost)
-        bias = None if _is_zero(by_x) else by_x
+        bias = None if is_zero(by_x) else by_x
         by_e, by_w = C * (beta if node.seen else c), D * beta if node.seen else D
         return Sensor(bias, by_e, by_w, beta, beta * (1 - beta), columns, lost)
 
@@ -205,7 +210,7 @@ class BallModel:
             others = sum((K_i[j] for j in K_i if j != i), arb_mat(nx, nx))
             if problem.unbiased:
                 K_i[i] = A - others  # what the node steps by; the file has it rounded
-                if not _is_zero(real_A - A):
+                if not is_zero(real_A - A):
                     self._add(s, self.e[i], self.x, real_A - A)
             elif self.x:
                 self._add(s, self.e[i], self.x, real_A - others - K_i[i])
@@ -260,7 +265,7 @@ class BallModel:
     @property
     def MM(self) -> arb_mat:
         """M'M: what |z_tilde|^2 is of eta, (n_eta, n_eta)."""
-        if self.x and not _is_zero(part(self.M, range(self.M.nrows()), self.x)):
+        if self.x and not is_zero(part(self.M, range(self.M.nrows()), self.x)):
             return self.M.transpose() * self.M
         MM, nz = arb_mat(self.size, self.size), self.M.nrows() // len(self.e)
         for i, e_i in enumerate(self.e):
@@ -306,7 +311,7 @@ def _inverse(T: Array) -> arb_mat:
     return arb_mat(fmpq_mat(rational).inv())
 
 
-def _is_zero(matrix: arb_mat) -> bool:
+def is_zero(matrix: arb_mat) -> bool:
     return all(entry.is_zero() for entry in matrix.entries())
 
 

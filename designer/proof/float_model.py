@@ -18,8 +18,10 @@ from agent.contract.arrays import Array
 from designer.decay import Decay, decay
 from designer.invariants import invariants
 from designer.proof.ball_model import BallModel
+from designer.proof.balls import floats, part
 from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 from designer.proof.sparse import matrix
+from designer.steered import Steered
 
 Indices = NDArray[np.int64]
 
@@ -49,6 +51,7 @@ class FloatModel:
         self.states = len(balls.e[0])
         self.transition = enclosed([pi for row in balls.transition for pi in row], self.modes, self.modes)
         self.AB = self._mean(balls)  # block diagonal, a block for each mode
+        self._x = tuple(floats(part(balls.AB[0], balls.x, columns)) for columns in (balls.x, balls.w))
         self.AB_T = Enclosed(*(part.T.tocsr() for part in self.AB))
         self.cores, self.added, self.at = self._noise(balls)
         self.peak = self._peak(balls)
@@ -99,7 +102,13 @@ class FloatModel:
     def invariants(self) -> list[Array]:
         """Every P(s) for (17), (modes, n_eta, n_eta), found and not proved; none where the errors do not decay."""
         peak = np.tile(self.peak.middle, (self.modes, 1, 1))
-        return invariants(self.weigh, self.decay, weights(self._reach()), peak).P
+        return invariants(self.weigh, self.decay, weights(self._reach()), peak, self.steered).P
+
+    @cached_property
+    def steered(self) -> Steered | None:
+        """x, where it is in eta."""
+        A, B = self._x
+        return Steered(A, B) if len(A) else None
 
     def _reach(self) -> Array:
         """About the square of what w of energy 1 makes of each state of the plant, and of its errors, (n_eta,)."""

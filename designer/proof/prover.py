@@ -16,8 +16,11 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
+from designer.proof.by_gramian import ByGramian
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
-from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_leaps, recursion
+from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_costs, disproof_by_leaps, recursion
+from designer.proof.steering import BITS as BITS_OF_COSTS
+from designer.proof.steering import Steering
 from designer.proof.undisturbed import Starts, largest
 
 Make = Callable[..., Arithmetic]  # of a problem, K and H, and T
@@ -85,6 +88,19 @@ class Prover:
         return self._floats.model.invariants if self._given is None else [self._given]
 
     @cached_property
+    def by_gramian(self) -> ByGramian | None:
+        """Where chance has no say, and nobody says by which P; it knows at once what the recursion comes to."""
+        return ByGramian.of(self._problem, self._K, self._H) if self._given is None else None
+
+    @cached_property
+    def _steering(self) -> Steering | None:
+        """Where x decays slowly and is in eta."""
+        steered = self._floats.model.steered
+        if steered is None or self.P is None or not self._problem.plant.spectral_radius**2 > _SLOW:
+            return None
+        return Steering.of(self._problem, self.T, steered, self.P)
+
+    @cached_property
     def _floats(self) -> ByFloats:
         return ByFloats(self._problem, self._K, self._H, T=self.T)
 
@@ -98,8 +114,16 @@ class Prover:
 
     def exact(self, gamma: float, *, most: int = MOST_STEPS) -> Verdict:
         """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
+        if self.by_gramian is not None:
+            modes, sign = self._problem.mode_names, self.by_gramian.sign(gamma)
+            finding = found("M G M' < g", modes, [sign] * len(modes))
+            return _verdict(gamma, [_Answer(finding, self.by_gramian.name)])
         if self.P is None:
             return self._no_P(gamma)
+        if self._steering is not None:
+            answers = self._recursion(self.P, gamma, most=min(most, _STEPS_OF_OTHERS), costs=self._steering)
+            if all(proved(answer.findings) for answer in answers):
+                return _verdict(gamma, answers)
         for P in reversed(self._invariants[1:]):
             answers = self._recursion(P, gamma, most=min(most, _STEPS_OF_OTHERS))
             if all(proved(answer.findings) or refuted(answer.findings) for answer in answers) and len(answers) > 2:
@@ -109,29 +133,45 @@ class Prover:
             return _verdict(gamma, answers)
         return _verdict(gamma, [*self._disproof(gamma), *answers])
 
-    def _recursion(self, P: Array, gamma: float, *, most: int) -> list[_Answer]:
+    def _recursion(self, P: Array, gamma: float, *, most: int, costs: Steering | None = None) -> list[_Answer]:
         """(17), P > 0, and where both are proved the recursion with this P."""
         modes, answers = self._problem.mode_names, self._stability_by(P)
         if not all(proved(answer.findings) for answer in answers):
             return answers
-        return [
-            *answers,
-            self._ask(lambda by: recursion(by, modes, gamma, P, most=most), largest=_LARGEST_RECURSION),
-        ]
+        answer = self._ask(
+            lambda by: recursion(by, modes, gamma, P, most=most, costs=costs), largest=_LARGEST_RECURSION
+        )
+        return [*answers, answer if costs is None else answer._replace(arithmetic=_with_costs(answer.arithmetic))]
 
     def at_least(self, gamma: float, *, most: int = MOST_STEPS_BELOW) -> str | None:
         """In which arithmetic it is proved that the exact gain is not below gamma; None: in none, in so many steps.
 
         Of errors that decay slowly the steps that take long are made last.
         """
+        if self.by_gramian is not None:
+            return self.by_gramian.name if self.by_gramian.sign(gamma).refuted else None
         if most <= _STEPS_BEFORE_LEAPS:
             return self.at_least_by_steps(gamma, most=most)
         return (
-            self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
+            self.at_least_by_costs(gamma)
+            or self._fails(0, gamma, most=_STEPS_BEFORE_LEAPS)
             or self.at_least_by_leaps(gamma)
             or self.at_least_by_steps(gamma, most=most)
             or self.at_least_by_steps(gamma, most=_STEPS_OF_DISPROOF)  # in balls too
         )
+
+    def at_least_by_costs(self, gamma: float) -> str | None:
+        """The same where x decays slowly and is in eta, by what it costs to bring x somewhere."""
+        costs, modes = self._steering, self._problem.mode_names
+        if costs is None or not all(proved(answer.findings) for answer in self._stability):
+            return None
+        for k in range(len(self._makes)):
+            by = self._arithmetic(k)
+            if k and by.order > _LARGEST_RECURSION:
+                break
+            if disproof_by_costs(by, modes, gamma, costs, most=_STEPS_OF_OTHERS):
+                return _with_costs(by.name)
+        return None
 
     def at_least_by_leaps(self, gamma: float) -> str | None:
         """The same where errors decay slowly and are few, by a w = Gamma eta that is held."""
@@ -172,6 +212,8 @@ class Prover:
     @cached_property
     def stable(self) -> Stability:
         """By (17) and P > 0, or else by Z of `designer.decay`: Z - L(Z) > 0, and Z > 0 or some v'Z(s)v < 0."""
+        if self.by_gramian is not None and self.by_gramian.dies_out:
+            return Stability(True, self.by_gramian.name)
         if self.P is not None and all(proved(answer.findings) for answer in self._stability):
             return Stability(True, self._stability[0].arithmetic)
         Z, modes = self._floats.model.decay.total, self._problem.mode_names
@@ -247,6 +289,10 @@ class Prover:
         if stable.holds is False:
             why = "the errors are not mean-square stable, which is proved: from some start they never die out"
         return Verdict(False, gamma, stable.arithmetic, why, {})
+
+
+def _with_costs(arithmetic: str) -> str:
+    return f"{arithmetic}, and what w has to spend in balls of {BITS_OF_COSTS} bits"
 
 
 def _verdict(gamma: float, answers: Sequence[_Answer]) -> Verdict:

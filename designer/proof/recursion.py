@@ -64,16 +64,38 @@ class Arithmetic(Protocol):
         """About Y, (modes, n_eta, n_eta)."""
 
 
-def recursion(arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, most: int = MOST_STEPS) -> list[Finding]:
-    """W > 0 in every mode at each step, and then Y < g P in every mode; or the first that is not proved."""
+class Costs(Protocol):
+    """What w has to spend to bring x somewhere, beside a P that satisfies (17); designer.proof.steering."""
+
+    P: Array  # about the largest P with E eta'P eta <= E sum |w|^2
+
+    def ends(self, Y: Any, gamma: float) -> list[Sign]:
+        """Whether what Y weighs costs more, wherever eta may be: then the recursion need not go on."""
+
+    def outweighed(self, Y: Any, gamma: float, u: Array) -> list[Sign]:
+        """Whether Y weighs x = G u, and whatever errors there are then, by more than it costs to be there."""
+
+    def direction(self, Y: Array, gamma: float) -> Array | None:
+        """Such a u, (p,), as floats see it; None: there is none."""
+
+
+def recursion(
+    arithmetic: Arithmetic, modes: Modes, gamma: float, P: Array, *, most: int = MOST_STEPS, costs: Costs | None = None
+) -> list[Finding]:
+    """W > 0 in every mode at each step, and then Y < g P in every mode; or the first that is not proved.
+
+    With `costs`, g times what it costs to be at eta is in the place of g P.
+    """
+    bound = P if costs is None else costs.P
     most = min(most, max(_FEWEST, int(MOST_NUMBERS / (arithmetic.cost * len(modes) * arithmetic.order**2))))
     every: list[Finding] = []
     Y, next_look = arithmetic.start(up=True), 0
     for steps in range(most + 1):
         look(steps)
         if steps == most or steps >= next_look:
-            if _seems_below(arithmetic.floats(Y), P, gamma):
-                ends = found("Y < g P", modes, arithmetic.below(Y, P, gamma), f" after {steps} steps")
+            if _seems_below(arithmetic.floats(Y), bound, gamma):
+                below = arithmetic.below(Y, P, gamma) if costs is None else costs.ends(Y, gamma)
+                ends = found("Y < g P", modes, below, f" after {steps} steps")
                 if proved(ends):
                     return every + ends
             next_look = steps + 1 + steps // 16  # so that looking takes a sixteenth more steps, not as long as they
@@ -108,6 +130,24 @@ def disproof(
         if Y is None:
             break
     return None
+
+
+def disproof_by_costs(arithmetic: Arithmetic, modes: Modes, gamma: float, costs: Costs, *, most: int) -> bool:
+    """Whether it is proved that the recursion fails in the end, for all that w has to spend before."""
+    Y, next_look = arithmetic.start(up=False), 0
+    for step in range(most + 1):
+        if step >= next_look:
+            about = arithmetic.floats(Y)
+            u = costs.direction(about, gamma)
+            if u is not None and proved(found("", modes, costs.outweighed(Y, gamma, u))):
+                return True
+            if _seems_below(about, costs.P, gamma):
+                return False
+            next_look = step + 1 + step // 16
+        signs, Y = arithmetic.step(Y, gamma, up=False)
+        if Y is None:
+            return any(sign.refuted for sign in signs)
+    return False
 
 
 class Leaping(Arithmetic, Protocol):

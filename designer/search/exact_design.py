@@ -16,6 +16,7 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
+from designer.gain.alone import Alone
 from designer.gain.exact import (
     Gain,
     InvariantSet,
@@ -342,9 +343,13 @@ def certify(
 def certify_at_once(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
     """A gamma that a recursion of few steps proves; or Unattainable.
 
-    Where errors decay slowly it is above the exact gain, of which nothing is said.
+    Where errors decay slowly it is above the exact gain, of which nothing is said; but where chance has no say that is
+    known at once.
     """
-    operator = Operator(model_of_gains(problem, K, H))
+    model = model_of_gains(problem, K, H)
+    if Alone.of(model) is not None:
+        return certify(problem, K, H)
+    operator = Operator(model)
     invariant, g = invariant_set(operator), _FIRST_AT_ONCE * horizon_gain(operator, 1)[1]
     while invariant.P and g < _HIGHEST and not recursion_holds(operator, g, _STEPS_AT_ONCE, invariant=invariant).holds:
         g *= _GROWTH_AT_ONCE
@@ -371,6 +376,12 @@ def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) ->
     if problem.n * problem.nx > _PROVED_STATES:
         return gain.low * (1.0 - _BELOW[3])
     prover, slow = Prover(problem, K, H), gain.radius > SLOW
+    if prover.by_gramian is not None:
+        return next((low for part in _BELOW if prover.at_least(low := gain.low * (1.0 - part))), 0.0)
+    if slow:
+        by_costs = (low for part in _LEAPT if prover.at_least_by_costs(low := gain.low * (1.0 - part)))
+        if (found := next(by_costs, None)) is not None:
+            return found
     if slow and prover.at_least_by_leaps(least := gain.low * (1.0 - _LEAPT[-1])):
         ends = {end * (1.0 - part) for part in _LEAPT for end in (gain.low, gain.high)}
         leapt = sorted((low for low in ends if low > least), reverse=True)
