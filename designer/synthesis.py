@@ -29,7 +29,9 @@ from designer.search.exact_design import confirmed, design_exact, gain_of, lower
 from designer.search.lmi_apart import design_apart
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
-_PROVED_STATES = 250  # n nx up to which gains that ignore all are an answer too, where a second signal cut the proof short
+_PROVED_STATES = (
+    250  # n nx up to which gains that ignore all are an answer too, where a second signal cut the proof short
+)
 SHARE_OF_BOX = 0.5  # of a search's time
 _SHARE_OF_WEIGHTS = 0.002  # of the budget, for what no gains are below by an LMI
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time

@@ -49,7 +49,7 @@ def natural_units(problem: Problem) -> Units:
 def natural_scale(model: ErrorModel) -> Array:
     """For each entry of eta a power of two, 1 over about what w of energy 1 makes of it within a few steps, (n_eta,).
 
-    The errors of a state have its unit. A state that w does not reach has the largest of the others.
+    The errors of a state have its unit.
     """
     reach, moved, nx = np.zeros((model.modes, model.size)), model.B, model.H.shape[1] // len(model.rows)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -57,9 +57,23 @@ def natural_scale(model: ErrorModel) -> Array:
             reach += (moved**2).sum(axis=2)
             moved = model.A @ moved
     of_state = reach.reshape(-1, nx).max(axis=0)
-    known = (of_state > 0.0) & np.isfinite(of_state)
-    of_state = np.where(known, of_state, of_state[known].max(initial=0.0) or 1.0)
-    return np.tile(1.0 / _power(np.sqrt(of_state)), model.size // nx)
+    units = of_all_states(
+        of_state, lambda: np.abs(model.A).max(axis=0).reshape(-1, nx, model.size // nx, nx).max(axis=(0, 2))
+    )
+    return np.tile(1.0 / _power(units), model.size // nx)
+
+
+def of_all_states(reach: Array, moves: Callable[[], Array]) -> Array:
+    """Units of states by the square of what w makes of them, (nx,), and by the largest |a_ij|, (nx, nx), for the rest.
+
+    A state that w does not reach has what moves the others by theirs; one that moves none of them has the largest.
+    """
+    known = (reach > 0.0) & np.isfinite(reach)
+    units = np.sqrt(np.where(known, reach, 0.0))
+    if not known.all():
+        rows = moves()
+        units = _filled(units, lambda units: _shown(rows, units))
+    return np.where(units > 0.0, units, units.max() or 1.0)
 
 
 class Measures(NamedTuple):
@@ -156,16 +170,27 @@ def common_units(problem: Problem) -> Measures:
         for _ in range(problem.nx + _STEPS_OF_SCALE):
             moved = A @ moved / 2.0
             state = state + moved
-        for _ in range(problem.nx):
-            known = state > 0.0
-            shown = (A[known] / state[known, None]).sum(axis=0)
-            for node in nodes:
-                size = _lengths(node.C * state, node.D)
-                shown = shown + (np.abs(node.C[size > 0.0]) / size[size > 0.0, None]).sum(axis=0)
-            state = np.where(known | (shown == 0.0), state, 1.0 / shown)
-    state = np.where((state > 0.0) & np.isfinite(state), state, 1.0)
+        rows = [(node.C, node.D) for node in nodes]
+        state = _filled(
+            state,
+            lambda units: _shown(A, units) + sum(_shown(np.abs(C), _lengths(C * units, D)) for C, D in rows),
+        )
+    state = _or_1(state)
     y = [_or_1(_lengths(node.C * state, node.D)) for node in nodes]
     return Measures(state, y, float(_or_1(np.array(np.linalg.norm(problem.plant.M * state)))))
+
+
+def _filled(units: Array, shown: Callable[[Array], Array]) -> Array:
+    """Where they are 0 the inverse of what is shown of a state in those that are not, as far as it is shown by any."""
+    for _ in units:
+        more = shown(units)
+        units = np.where((units > 0.0) | (more == 0.0), units, 1.0 / np.where(more == 0.0, 1.0, more))
+    return units
+
+
+def _shown(rows: Array, units: Array) -> Array:
+    """The sum of all rows, each in its unit, but for those without one."""
+    return np.asarray((rows[units > 0.0] / units[units > 0.0, None]).sum(axis=0))
 
 
 def _near_1(problem: Problem) -> Measures:
