@@ -13,7 +13,7 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.parts import CONTINUOUS
-from designer.coordinates import Coordinates, reached
+from designer.coordinates import Coordinates, filled, of_all_states, reached, shown
 from designer.model.error_model import ErrorModel
 
 _FEW = 8
@@ -61,19 +61,6 @@ def natural_scale(model: ErrorModel) -> Array:
         of_state, lambda: np.abs(model.A).max(axis=0).reshape(-1, nx, model.size // nx, nx).max(axis=(0, 2))
     )
     return np.tile(1.0 / _power(units), model.size // nx)
-
-
-def of_all_states(reach: Array, moves: Callable[[], Array]) -> Array:
-    """Units of states by the square of what w makes of them, (nx,), and by the largest |a_ij|, (nx, nx), for the rest.
-
-    A state that w does not reach has what moves the others by theirs; one that moves none of them has the largest.
-    """
-    known = (reach > 0.0) & np.isfinite(reach)
-    units = np.sqrt(np.where(known, reach, 0.0))
-    if not known.all():
-        rows = moves()
-        units = _filled(units, lambda units: _shown(rows, units))
-    return np.where(units > 0.0, units, units.max() or 1.0)
 
 
 class Measures(NamedTuple):
@@ -171,26 +158,13 @@ def common_units(problem: Problem) -> Measures:
             moved = A @ moved / 2.0
             state = state + moved
         rows = [(node.C, node.D) for node in nodes]
-        state = _filled(
+        state = filled(
             state,
-            lambda units: _shown(A, units) + sum(_shown(np.abs(C), _lengths(C * units, D)) for C, D in rows),
+            lambda units: shown(A, units) + sum(shown(np.abs(C), _lengths(C * units, D)) for C, D in rows),
         )
     state = _or_1(state)
     y = [_or_1(_lengths(node.C * state, node.D)) for node in nodes]
     return Measures(state, y, float(_or_1(np.array(np.linalg.norm(problem.plant.M * state)))))
-
-
-def _filled(units: Array, shown: Callable[[Array], Array]) -> Array:
-    """Where they are 0 the inverse of what is shown of a state in those that are not, as far as it is shown by any."""
-    for _ in units:
-        more = shown(units)
-        units = np.where((units > 0.0) | (more == 0.0), units, 1.0 / np.where(more == 0.0, 1.0, more))
-    return units
-
-
-def _shown(rows: Array, units: Array) -> Array:
-    """The sum of all rows, each in its unit, but for those without one."""
-    return np.asarray((rows[units > 0.0] / units[units > 0.0, None]).sum(axis=0))
 
 
 def _near_1(problem: Problem) -> Measures:

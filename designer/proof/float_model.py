@@ -15,9 +15,9 @@ from flint import arb
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
+from designer.coordinates import of_all_states
 from designer.decay import Decay, decay
 from designer.invariants import invariants
-from designer.model.units import of_all_states
 from designer.proof.ball_model import BallModel
 from designer.proof.float64 import TINY, UP, Bounded, U, product, relative, symmetric, times, weights, within
 from designer.proof.sparse import matrix
