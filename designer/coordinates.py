@@ -9,6 +9,7 @@ and all that is carried over is rounded once.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -37,6 +38,32 @@ def reached(problem: Problem) -> Array:
         for _ in range(_DOUBLINGS):
             gramian, power = gramian + power @ gramian @ power.T, power @ power
     return np.asarray(gramian)
+
+
+def of_all_states(reach: Array, moves: Callable[[], Array]) -> Array:
+    """Units of states by the square of what w makes of them, (nx,), and by the largest |a_ij|, (nx, nx), for the rest.
+
+    A state that w does not reach has what moves the others by theirs; one that moves none of them has the largest.
+    """
+    known = (reach > 0.0) & np.isfinite(reach)
+    units = np.sqrt(np.where(known, reach, 0.0))
+    if not known.all():
+        rows = moves()
+        units = filled(units, lambda units: shown(rows, units))
+    return np.where(units > 0.0, units, units.max() or 1.0)
+
+
+def filled(units: Array, by: Callable[[Array], Array]) -> Array:
+    """Where they are 0 the inverse of what is shown of a state in those that are not, as far as it is shown by any."""
+    for _ in units:
+        more = by(units)
+        units = np.where((units > 0.0) | (more == 0.0), units, 1.0 / np.where(more == 0.0, 1.0, more))
+    return units
+
+
+def shown(rows: Array, units: Array) -> Array:
+    """The sum of all rows, each in its unit, but for those without one."""
+    return np.asarray((rows[units > 0.0] / units[units > 0.0, None]).sum(axis=0))
 
 
 class Coordinates:

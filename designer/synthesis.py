@@ -9,33 +9,29 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from agent.contract.errors import InputError, Unattainable, listed
-from agent.contract.gains import Certificate, Gains, LinkMatrices
+from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.box.design import ForBox, design_for_box
 from designer.box.extent import Box
 from designer.coordinates import Coordinates
 from designer.diagnosis import explained, refuse_hopeless, refuse_nothing_to_estimate
-from designer.gain.exact import exact_gain
 from designer.gain.floor import floor_below
 from designer.gain.worst_case import with_worst_case
 from designer.lmi.lmi_design import METHODS, design_by_lmi, first_confirmed, gains_that_ignore
-from designer.model.error_model import model_of_gains
 from designer.model.units import NaturalUnits
 from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.certificate import lyapunov_matrix
-from designer.proof.prover import Prover
 from designer.search.baselines import BASELINES, design_baseline
 from designer.search.descent import Progress
 from designer.search.effort import BUDGET, default_method
-from designer.search.exact_design import certify, certify_at_once, confirmed, design_exact, lower_end
+from designer.search.exact_design import confirmed, design_exact, gain_of, lower_end
 from designer.search.lmi_apart import design_apart
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
-_PROVED_STATES = 250  # n nx up to which gains are proved again in the units of the problem
-_SMALLEST = 1e-40  # and its inverse: products of some such numbers are far from the ends of float64
+_PROVED_STATES = (
+    250  # n nx up to which gains that ignore all are an answer too, where a second signal cut the proof short
+)
 SHARE_OF_BOX = 0.5  # of a search's time
 _SHARE_OF_WEIGHTS = 0.002  # of the budget, for what no gains are below by an LMI
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
@@ -179,7 +175,7 @@ def _exact_in_natural_units(
     dask: str | None,
     slack: float,
 ) -> Gains:
-    """The same gains whatever the units: a problem in other powers of two of them is the same one, number by number.
+    """The same gains whatever the units: a problem in others is the same one in natural units, number by number.
 
     Where M cancels, z itself is a state in the search; if that leads nowhere, as where what z is made of grows and
     sensors hardly tell it apart, the states are those of the problem after all.
@@ -199,9 +195,9 @@ def _searched(
     dask: str | None,
     slack: float,
 ) -> Gains:
-    """What is proved in natural units is proved of the problem that was given; of small networks it is proved again.
+    """Found in natural units, and proved of the problem that was given, with gains as they are rounded for it.
 
-    In other coordinates gains are rounded on the way back, so there all is found again.
+    What is said of an LMI beside that is computed, of the problem in natural units.
     """
     unit, tell = natural.output, progress
     if progress is not None and unit != 1.0:
@@ -210,44 +206,17 @@ def _searched(
             noise = None if at.noise is None else unit**2 * at.noise
             progress(at._replace(gamma=unit * at.gamma, noise=noise))
 
-    gains = design_exact(
-        natural.problem, budget=budget, progress=tell, dask=dask, unit=unit, slack=slack, held=natural.held
-    )
+    how: dict[str, Any] = {"unit": unit, "slack": slack, "held": natural.held, "natural": natural}
+    gains = design_exact(natural.problem, budget=budget, progress=tell, dask=dask, **how)
     K, H = natural.back(gains.K, gains.H)
-    certificate = _in_units_of(gains.certificate, unit)
-    if natural.coordinates is not None:
-        compared = {"lmi_gamma": certificate.lmi_gamma, "lmi_exact": certificate.lmi_exact}
-        certificate = _certified(problem, K, H, budget).model_copy(update=compared)
-    elif not _proved_again(problem, K, H, certificate.gamma, budget):  # numbers near the ends of float64
-        certificate = _certified(problem, K, H, budget)
+    lmi_gamma, lmi_exact = gains.certificate.lmi_gamma, gains.certificate.lmi_exact
+    compared = {
+        "lmi_gamma": None if lmi_gamma is None else unit * lmi_gamma,
+        "lmi_exact": None if lmi_exact is None else (unit * lmi_exact[0], unit * lmi_exact[1]),
+    }
+    certificate = gains.certificate.model_copy(update=compared)
     update = {"problem": problem, "problem_digest": problem.digest(), "K": K, "H": H, "certificate": certificate}
     return gains.model_copy(update=update)
-
-
-def _certified(problem: Problem, K: LinkMatrices, H: LinkMatrices, budget: Budget) -> Certificate:
-    return budget.to_its_end(lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H))
-
-
-def _proved_again(problem: Problem, K: LinkMatrices, H: LinkMatrices, gamma: float, budget: Budget) -> bool:
-    """Of small networks; of others, and where time is up, powers of two leave a proof of numbers in range as it is."""
-    if problem.n * problem.nx <= _PROVED_STATES and not budget.is_over:
-        with suppress(KeyboardInterrupt, TimeIsUp), looking(budget.check_comparison):
-            return Prover(problem, K, H).exact(gamma).holds
-    plant, nodes = problem.plant, problem.nodes
-    heard = [row for links in (K, H) for of_mode in links.values() for row in of_mode.values()]
-    gains = [matrix for row in heard for matrix in row.values()]
-    every = [plant.A, plant.B, plant.M, *(node.C for node in nodes), *(node.D for node in nodes), *gains]
-    sizes = np.abs(np.concatenate([matrix.reshape(-1) for matrix in every]))
-    return bool(((sizes == 0.0) | ((sizes > _SMALLEST) & (sizes < 1.0 / _SMALLEST))).all())
-
-
-def _in_units_of(certificate: Certificate, unit: float) -> Certificate:
-    """What is claimed of z in units of `unit`, said of z itself."""
-    values: dict[str, Any] = {name: getattr(certificate, name) for name in ("gamma", "lmi_gamma", "floor")}
-    pairs = {name: getattr(certificate, name) for name in ("exact", "lmi_exact")}
-    said = {name: None if value is None else unit * value for name, value in values.items()}
-    said |= {name: None if pair is None else (unit * pair[0], unit * pair[1]) for name, pair in pairs.items()}
-    return certificate.model_copy(update=said)
 
 
 def _with_exact(gains: Gains, budget: Budget) -> Gains:
@@ -267,7 +236,7 @@ def _with_gain(gains: Gains) -> Gains:
     """With it, and what is proved of it."""
     problem, certificate = gains.problem, gains.certificate
     started = time.perf_counter()
-    gain = exact_gain(model_of_gains(problem, gains.K, gains.H))
+    gain = gain_of(problem, gains.K, gains.H)
     exact = gain.bounds
     found: dict[str, object] = {"exact": exact}
     if exact is not None and exact[1] < certificate.gamma:
@@ -291,8 +260,9 @@ def _solvable(problem: Problem) -> bool:
     """Whether the decomposed LMI has an answer that is confirmed."""
     from designer.lmi import decomposed
 
+    natural = NaturalUnits(problem)
     try:
-        first_confirmed(problem, "decomposed", decomposed.answers(problem, last_resort=False), Budget())
+        first_confirmed(natural, "decomposed", decomposed.answers(natural.problem, last_resort=False), Budget())
     except Unattainable:
         return False
     return True

@@ -28,7 +28,7 @@ from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
 from designer.ladder import Ladder, percent
 from designer.model.error_model import link_gains, stacked_links
-from designer.model.units import NaturalUnits
+from designer.model.units import NaturalUnits, rounded
 from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.deviations import Entry
 from designer.search import bfgs
@@ -248,7 +248,7 @@ class _Search:
 
 
 def _scaled(entry: Entry, units: NaturalUnits) -> Entry:
-    """An entry of the same matrix in these units."""
+    """An entry of the same matrix in these units, rounded as the matrix is."""
     r, c, x, y = entry.row, entry.column, units.state, units.y[entry.node]
     match entry.matrix:
         case "A":
@@ -261,4 +261,5 @@ def _scaled(entry: Entry, units: NaturalUnits) -> Entry:
             by = x[c] / y[r]
         case _:
             by = 1.0 / y[r]
-    return entry._replace(radius=entry.radius * float(by))
+    radius = entry.radius * float(by)
+    return entry._replace(radius=radius if units.exactly else float(rounded(np.array(radius))))

@@ -39,7 +39,7 @@ def floor(problem: Problem) -> float:
     Riccati equation with w shared by plant and sensors, and needs no inverse of D D'. C is beta_i C_i where hidden.
     In natural units: what is small beside what depends on them otherwise.
     """
-    natural = NaturalUnits(problem, Coordinates.of(problem))
+    natural = NaturalUnits(problem, Coordinates.of(problem), exactly=True)
     problem, plant = natural.problem, natural.problem.plant
     C = np.vstack([node.C if node.seen else node.arrival_probability * node.C for node in problem.nodes])
     D = np.vstack([node.D for node in problem.nodes])

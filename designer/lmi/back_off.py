@@ -12,7 +12,7 @@ Candidates are screened by Cholesky in floats; the first that passes is proved, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from designer.proof.findings import Verdict
 from designer.proof.prover import Prover
 
 Form = Literal["structured", "full"]
+Prove = Callable[[Array, float], Verdict]  # that P proves gamma
 
 _ABOVE = 1.0 + 1e-9  # gamma stands this factor above the infimum of (18), so that (18) is strict
 _MOST_STEPS = 5000
@@ -41,25 +42,28 @@ class Confirmed(NamedTuple):
     verdict: Verdict
 
 
-def back_off(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array) -> Confirmed:
+def back_off(problem: Problem, K: LinkMatrices, H: LinkMatrices, P: Array, prove: Prove | None = None) -> Confirmed:
     """The first P(t), from t = 0 upwards, whose gamma is proved; if none is, the one tried last.
 
-    First with P0 = diag{R0, 0}, which keeps the form diag{R, Q(s)} of Theorem 1; then with a full P0.
+    First with P0 = diag{R0, 0}, which keeps the form diag{R, Q(s)} of Theorem 1; then with a full P0. `prove` is for
+    gains that are told, with P and gamma, in other units.
     """
     model = error_model(problem, *stacked_links(problem, K, H))
+    if prove is None:
+
+        def prove(P: Array, gamma: float) -> Verdict:
+            return Prover(problem, K, H, P=P).theorem1(gamma)
+
     for form, t, candidate in _candidates(model, _lifted(P)):
         if satisfies_17(model, candidate):
-            confirmed = _prove(problem, K, H, model, candidate, form, t)
+            confirmed = _confirmed(prove, model, candidate, form, t)
             if confirmed.verdict.holds:
                 return confirmed
-    return _prove(problem, K, H, model, candidate, form, t)
+    return _confirmed(prove, model, candidate, form, t)
 
 
-def _prove(
-    problem: Problem, K: LinkMatrices, H: LinkMatrices, model: ErrorModel, P: Array, form: Form, t: float
-) -> Confirmed:
-    gamma = least_gamma(model.M, P) * _ABOVE
-    return Confirmed(P, form, t, Prover(problem, K, H, P=P).theorem1(gamma))
+def _confirmed(prove: Prove, model: ErrorModel, P: Array, form: Form, t: float) -> Confirmed:
+    return Confirmed(P, form, t, prove(P, least_gamma(model.M, P) * _ABOVE))
 
 
 def _candidates(model: ErrorModel, P: Array) -> Iterator[tuple[Form, float, Array]]:

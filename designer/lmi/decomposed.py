@@ -134,7 +134,7 @@ def answers(problem: Problem, *, last_resort: bool = True) -> Iterator[LmiSoluti
     """
     natural, own = natural_units(problem), Units(np.ones(problem.nx), 1.0)
     plan = [Attempt("", partial(_run, problem, conic.clarabel, natural))]
-    plan.append(Attempt(" in the problem's own units", partial(_run, problem, conic.clarabel, own)))
+    plan.append(Attempt(" in other units", partial(_run, problem, conic.clarabel, own)))
     if last_resort and conic.installed(conic.scs):
         plan.append(Attempt("", partial(_run, problem, conic.scs, natural), last_resort=True))
     return attempts.answers(f"the decomposed LMI for {problem.name}", plan)

@@ -1,4 +1,8 @@
-"""Gains by the paper's LMI: solve, recover the gains by (38), prove, and back off where needed."""
+"""Gains by the paper's LMI: solve, recover the gains by (38), prove, and back off where needed.
+
+All but the proof is done in natural units: there the same problem is solved, whatever the units of the one that was
+given. The proof is of that one, with gains and P in its units.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +18,18 @@ from agent.contract.gains import Certificate, Gains, LinkMatrices, Solver, Weigh
 from agent.contract.problem import Problem
 from designer.lmi import LmiSolution
 from designer.lmi.attempts import tried_further
-from designer.lmi.back_off import Confirmed, back_off, least_gamma, satisfies_17
+from designer.lmi.back_off import Confirmed, Prove, back_off, least_gamma, satisfies_17
 from designer.lmi.inwards import inwards
 from designer.lmi.recovery import block_diagonal, links, unconfirmed
 from designer.model.error_model import error_model, link_gains, stacked_links
-from designer.model.units import natural_units
+from designer.model.units import NaturalUnits, natural_units
 from designer.patience import Budget, TimeIsUp, looking
+from designer.proof.findings import Verdict
 from designer.proof.prover import Prover
 
 
 class Designed(NamedTuple):
-    """Gains, and what the check says of them."""
+    """Gains and P in natural units, and what the check says of them in those of the problem that was given."""
 
     K: LinkMatrices
     H: LinkMatrices
@@ -37,22 +42,23 @@ class Designed(NamedTuple):
 
 def design_by_lmi(problem: Problem, method: str, budget: Budget | None = None) -> Gains:
     """KeyboardInterrupt and TimeIsUp where a signal or the end of the budget came before an answer was confirmed."""
-    started, budget = time.perf_counter(), Budget() if budget is None else budget
+    started, budget, natural = time.perf_counter(), Budget() if budget is None else budget, NaturalUnits(problem)
     try:
-        found = first_confirmed(problem, method, METHODS[method](problem), budget)
+        found = first_confirmed(natural, method, METHODS[method](natural.problem), budget)
     except Unattainable as error:
         ignorant = gains_that_ignore(problem, method, str(error), started) if method in MOVABLE else None
         if ignorant is None:
             raise
         return ignorant
-    solution, (K, H, confirmed), certify = found
+    solution, designed, certify = found
     ended = time.perf_counter()
     return Gains.of(
         problem,
-        K,
-        H,
+        *natural.back(designed.K, designed.H),
         method=method,
-        certificate=_certificate(problem, confirmed, lmi_gamma=solution.gamma, weights=_weights(problem, solution)),
+        certificate=_certificate(
+            natural, designed.confirmed, lmi_gamma=solution.gamma, weights=_weights(natural, solution)
+        ),
         solver=solution.solver,
         solve=ended - started - certify,
         certify=certify,
@@ -61,24 +67,25 @@ def design_by_lmi(problem: Problem, method: str, budget: Budget | None = None) -
 
 def gains_that_ignore(problem: Problem, method: str, why: str, started: float) -> Gains | None:
     """What is left of a design that began then and came to nothing; None: of an unstable plant nothing is."""
-    begun, designed = time.perf_counter(), ignoring(problem)
+    begun, natural = time.perf_counter(), NaturalUnits(problem, exactly=True)
+    designed = ignoring(natural)
     if designed is None:
         return None
     status, ended = f"gains that ignore all measurements, because {why}", time.perf_counter()
     return Gains.of(
         problem,
-        designed.K,
-        designed.H,
+        *natural.back(designed.K, designed.H),
         method=method,
-        certificate=_certificate(problem, designed.confirmed, lmi_gamma=None),
+        certificate=_certificate(natural, designed.confirmed, lmi_gamma=None),
         solver=Solver(name="none", version="-", status=status, iterations=0, seconds=begun - started),
         solve=begun - started,
         certify=ended - begun,
     )
 
 
-def ignoring(problem: Problem) -> Designed | None:
+def ignoring(natural: NaturalUnits) -> Designed | None:
     """K_ii = A and no measurement: what is left where no answer of a solver is confirmed; None: an unstable plant."""
+    problem = natural.problem
     n, modes = problem.n, len(problem.topologies)
     K, H = link_gains(problem, np.tile(np.kron(np.eye(n), problem.plant.A), (modes, 1, 1)), no_measurements(problem))
     M = error_model(problem, *stacked_links(problem, K, H)).M
@@ -87,7 +94,7 @@ def ignoring(problem: Problem) -> Designed | None:
         W_inverse = np.asarray(np.linalg.inv(reachable(problem, spare)), dtype=np.float64)
         Q = np.tile((1.0 - spare) * W_inverse / n, (modes, n, 1, 1))
         P = block_diagonal(spare * W_inverse[:p, :p], (Q + Q.swapaxes(2, 3)) / 2.0)
-        verdict = Prover(problem, K, H, P=P).theorem1(least_gamma(M, P) * (1.0 + 1e-9))
+        verdict = _prove(natural, K, H)(P, least_gamma(M, P) * (1.0 + 1e-9))
         if verdict.holds:
             return Designed(K, H, Confirmed(P, "structured", 0.0, verdict))
     return None
@@ -114,10 +121,11 @@ def no_measurements(problem: Problem) -> Array:
 
 
 def first_confirmed(
-    problem: Problem, method: str, answers: Iterator[LmiSolution], budget: Budget
+    natural: NaturalUnits, method: str, answers: Iterator[LmiSolution], budget: Budget
 ) -> tuple[LmiSolution, Designed, float]:
     """The first answer whose gamma the check confirms at most _NEAR above the LMI's; else the best that it confirms.
 
+    `answers` are those for natural.problem; gamma of the one that is returned is that of the problem that was given.
     With the seconds that the checks took. Unattainable: no answer, or none that is confirmed. KeyboardInterrupt,
     TimeIsUp: none yet.
     """
@@ -133,11 +141,11 @@ def first_confirmed(
             break
         if following is None:
             break
-        solution, begun = following, time.perf_counter()
+        solution, begun = following._replace(gamma=natural.output * following.gamma), time.perf_counter()
         try:
             with looking(budget.check_last):
-                designed = (_moved_inwards(problem, solution) if method in MOVABLE else None) or _confirm(
-                    problem, solution
+                designed = (_moved_inwards(natural, solution) if method in MOVABLE else None) or _confirm(
+                    natural, solution
                 )
         except Unattainable as error:
             refused = refused or error
@@ -153,20 +161,32 @@ def first_confirmed(
     return tried_further(best[0], solution), best[1], seconds
 
 
-def _confirm(problem: Problem, solution: LmiSolution) -> Designed:
+def _prove(natural: NaturalUnits, K: LinkMatrices, H: LinkMatrices) -> Prove:
+    """Of the problem that was given, from P and gamma in natural units."""
+    given = natural.back(K, H)
+
+    def prove(P: Array, gamma: float) -> Verdict:
+        return Prover(natural.given, *given, P=natural.P_back(P)).theorem1(natural.output * gamma)
+
+    return prove
+
+
+def _confirm(natural: NaturalUnits, solution: LmiSolution) -> Designed:
     """The solver's own gains; their P and gamma backed off until the check confirms them; or Unattainable."""
+    problem = natural.problem
     K, H = links(problem, solution)
-    confirmed = back_off(problem, K, H, block_diagonal(solution.R, solution.Q))
+    confirmed = back_off(problem, K, H, block_diagonal(solution.R, solution.Q), _prove(natural, K, H))
     if not confirmed.verdict.holds:
         raise unconfirmed(problem, solution, confirmed.verdict.failure)
     return Designed(K, H, confirmed)
 
 
-def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
+def _moved_inwards(natural: NaturalUnits, solution: LmiSolution) -> Designed | None:
     """Gains and P together a little inside the LMI, so that P keeps its form; None: not confirmed that way.
 
     For an unstable plant the answer itself has something to spare: the LMI was solved with a margin.
     """
+    problem = natural.problem
     for t in STEPS_INWARDS if problem.plant.spectral_radius < 1.0 else (0.0,):
         moved = inwards(problem, solution, t) if t else solution
         K, H = links(problem, moved)
@@ -175,22 +195,26 @@ def _moved_inwards(problem: Problem, solution: LmiSolution) -> Designed | None:
         if not satisfies_17(model, P):
             continue
         gamma = least_gamma(model.M, P) * (1.0 + 1e-9 + t / 100.0)  # so that (18) is strict
-        verdict = Prover(problem, K, H, P=P).theorem1(gamma)
+        verdict = _prove(natural, K, H)(P, gamma)
         if verdict.holds:
             return Designed(K, H, Confirmed(P, "structured", t, verdict))
     return None
 
 
-def _weights(problem: Problem, solution: LmiSolution) -> Weights | None:
+def _weights(natural: NaturalUnits, solution: LmiSolution) -> Weights | None:
     """The multipliers, which prove nothing yet: designer.undercut makes of them what does, if anything can be made."""
-    V = solution.weights
-    return None if V is None else Weights.of(np.eye(problem.nx), V, problem.mode_names)
+    if solution.weights is None:
+        return None
+    problem = natural.given
+    return Weights.of(np.eye(problem.nx), natural.V_back(solution.weights), problem.mode_names)
 
 
 def _certificate(
-    problem: Problem, confirmed: Confirmed, *, lmi_gamma: float | None, weights: Weights | None = None
+    natural: NaturalUnits, confirmed: Confirmed, *, lmi_gamma: float | None, weights: Weights | None = None
 ) -> Certificate:
-    P, verdict, nx, p = confirmed.P, confirmed.verdict, problem.nx, problem.plant_states
+    """Of the problem that was given."""
+    problem, P, verdict = natural.given, natural.P_back(confirmed.P), confirmed.verdict
+    nx, p = problem.nx, problem.plant_states
     modes, nodes = problem.mode_names, problem.node_names
     structured = confirmed.form == "structured"
     parts = [slice(p + i * nx, p + (i + 1) * nx) for i in range(problem.n)]
@@ -217,13 +241,13 @@ def _certificate(
 def _theorem2(problem: Problem) -> Iterator[LmiSolution]:
     from designer.lmi import theorem2  # cvxpy takes seconds to import, so only who solves pays for it
 
-    return theorem2.answers(problem)
+    return theorem2.answers(problem, unit=_LARGER)
 
 
 def _theorem2_reduced(problem: Problem) -> Iterator[LmiSolution]:
     from designer.lmi import theorem2
 
-    return theorem2.answers(problem, reduced=True)
+    return theorem2.answers(problem, reduced=True, unit=_LARGER)
 
 
 def _decomposed(problem: Problem) -> Iterator[LmiSolution]:
@@ -241,6 +265,7 @@ METHODS: dict[str, Callable[[Problem], Iterator[LmiSolution]]] = {
 # Methods whose gains may be moved a little together with P: their P stays small enough to store for large networks.
 # The others are the paper's, and their gains stay as the solver gave them.
 MOVABLE = frozenset({"decomposed"})
+_LARGER = 2.0  # than natural units: of what was tried, so the P of the literal LMI is the most often provable
 _SPARE = (1e-6, 1e-4, 1e-2)  # of P, for x and for strictness
 _DOUBLINGS = 60
 _NEAR = 5e-4  # a certified gamma this little above the LMI's, relatively, is taken at once

@@ -54,15 +54,18 @@ def solve(problem: Problem, *, reduced: bool = False) -> LmiSolution:
     return first_accurate(answers(problem, reduced=reduced))
 
 
-def answers(problem: Problem, *, reduced: bool = False) -> Iterator[LmiSolution]:
-    """What Clarabel says, then on rescaled data; then SCS, where Clarabel says nothing at all."""
+def answers(problem: Problem, *, reduced: bool = False, unit: float = 1.0) -> Iterator[LmiSolution]:
+    """What Clarabel says, then on rescaled data; then SCS, where Clarabel says nothing at all.
+
+    At first states have units `unit` times as large as the problem's own.
+    """
     part = beyond_paper(problem)
     if part is not None:
         raise InputError(
             f"Theorem 2 is the paper's, and the paper does not know that {part}, as it is in {problem.name}; "
             "use --method decomposed, or --method exact"
         )
-    own, natural = Units(np.ones(problem.nx), 1.0), natural_units(problem)
+    own, natural = Units(np.full(problem.nx, unit), 1.0), natural_units(problem)
     plan = [
         Attempt("", partial(_attempt, problem, cp.CLARABEL, own, reduced)),
         Attempt(" on rescaled data", partial(_attempt, problem, cp.CLARABEL, natural, reduced)),

@@ -15,6 +15,7 @@ from flint import arb
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
+from designer.coordinates import of_all_states
 from designer.decay import Decay, decay
 from designer.invariants import invariants
 from designer.proof.ball_model import BallModel
@@ -119,8 +120,20 @@ class FloatModel:
             moved = product(self.AB.middle, X.reshape(-1, nw)).reshape(self.modes, n, nw)
             reach += (moved**2).sum(axis=2)
             X[:, :n], X[:, n:] = moved, 0.0
-        of_state = reach.reshape(-1, self.states).max(axis=0)
-        return np.tile(np.where(of_state > 0.0, of_state, of_state.max()), n // self.states)
+        of_state = of_all_states(reach.reshape(-1, self.states).max(axis=0), self._moves)
+        return np.tile(of_state**2, n // self.states)
+
+    def _moves(self) -> Array:
+        """The largest |a_ij| from a state j to i, or their errors, (nx, nx)."""
+        found, entries = np.zeros((self.states, self.states)), abs(self.AB.middle).tocoo()
+        columns = entries.col % self.order
+        inside = columns < self.size
+        np.maximum.at(
+            found,
+            (entries.row[inside] % self.size % self.states, columns[inside] % self.states),
+            entries.data[inside],
+        )
+        return found
 
     def _mean(self, balls: BallModel) -> Enclosed:
         """[A B]."""

@@ -11,6 +11,7 @@ from agent.contract.errors import Unattainable
 from agent.contract.gains import Gains, Solver
 from agent.contract.problem import Problem
 from designer.model.error_model import StackedGains, link_gains
+from designer.model.units import NaturalUnits
 from designer.patience import Budget
 from designer.search.exact_design import certify, certify_at_once
 from designer.search.starts import consensus_gains, diffusion_gains, least_variance_gains
@@ -24,12 +25,12 @@ BASELINES: dict[str, Callable[[Problem], StackedGains]] = {
 
 def design_baseline(problem: Problem, method: str, budget: Budget) -> Gains:
     """The gains of one of BASELINES with a certificate; Unattainable where they let errors grow."""
-    started = time.perf_counter()
-    stacked = BASELINES[method](problem)
+    started, natural = time.perf_counter(), NaturalUnits(problem)
+    stacked = BASELINES[method](natural.problem)
     solved = time.perf_counter()
     if not all(np.isfinite(gains).all() for gains in stacked):
         raise Unattainable(f"{method} has no gains for {problem.name}: its Riccati equations have no finite solution")
-    K, H = link_gains(problem, *stacked)
+    K, H = natural.back(*link_gains(natural.problem, *stacked))
     try:
         certificate = budget.to_its_end(
             lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H)

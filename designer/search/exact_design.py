@@ -31,6 +31,7 @@ from designer.gain.floor import floor, floor_below
 from designer.lmi import LmiSolution, beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
+from designer.model.units import NaturalUnits
 from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
@@ -80,6 +81,7 @@ def design_exact(
     unit: float = 1.0,
     slack: float = 0.0,
     held: NDArray[np.bool_] | None = None,
+    natural: NaturalUnits | None = None,
 ) -> Gains:
     """Gains with the least exact gain that is found, from the given starts or, where there are none, from its own.
 
@@ -88,7 +90,7 @@ def design_exact(
     `first` and `last`: as `descend` takes them. KeyboardInterrupt ends the search, and so does the end of the budget,
     which begins when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is
     one. `unit`: of z; it counts in the status alone. `held` (nx, nx): entries of K_ij that are to be 0, unless windows
-    are searched.
+    are searched. `natural`: the units that `problem` is in; the certificate is for the one that was given.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     refuse_without_memory(problem)
@@ -136,9 +138,7 @@ def design_exact(
     if progress is not None:
         spent = time.perf_counter() - started
         progress(Progress("", 0.0, steps, gain.high, spent, gain.horizon, phase=phase))
-    certificate = budget.to_its_end(
-        lambda: certify(problem, K, H, gain=gain, budget=budget), lambda: certify_at_once(problem, K, H)
-    )
+    certificate = _certified(problem, K, H, gain, budget, natural)
     certificate = certificate.model_copy(update=_of_lmi(problem, begun_with, budget))
     ended = time.perf_counter()
     return Gains.of(
@@ -157,6 +157,17 @@ def design_exact(
         starts=begun - started,
         solve=solved - begun,
         certify=ended - solved,
+    )
+
+
+def _certified(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, budget: Budget, natural: NaturalUnits | None
+) -> Certificate:
+    """At length, or after a second signal at once."""
+    if natural is not None:
+        problem, (K, H), gain = natural.given, natural.back(K, H), in_units_of(natural.output, gain)
+    return budget.to_its_end(
+        lambda: certify(problem, K, H, gain=gain, budget=budget), lambda: certify_at_once(problem, K, H)
     )
 
 
@@ -310,10 +321,15 @@ def certify(
 
     Where the `budget` is over, the lower end is 0.
 
-    Where M cancels, what is known of it has too few digits.
+    Where M cancels, what is known of it has too few digits; so it may be where the roundings of natural units count,
+    and then it is computed with the numbers as they stand.
     """
-    if gain is None or Coordinates.of(problem) is not None:
-        gain = exact_gain(model_of_gains(problem, K, H))
+    if Coordinates.of(problem) is None:
+        gain = gain_of(problem, K, H) if gain is None else gain
+        verdict = confirmed(problem, K, H, gain.high) if gain.stable else None
+        if verdict is not None and verdict.holds:
+            return _certificate(problem, K, H, gain, verdict, budget)
+    gain = exact_gain(model_of_gains(problem, K, H))
     if not gain.stable:
         known = Prover(problem, K, H).stable.holds
         are = "are not mean-square stable, which is proved" if known is False else "are not known to be stable"
@@ -327,6 +343,13 @@ def certify(
             f"the exact gain {gain.high:.6g} of the gains for {problem.name} is not confirmed by the check "
             f"({verdict.failure})"
         )
+    return _certificate(problem, K, H, gain, verdict, budget)
+
+
+def _certificate(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, verdict: Verdict, budget: Budget | None
+) -> Certificate:
+    """With the lower end of the exact gain, where there is time for it."""
     low = (budget or Budget()).compared("the lower end of the exact gain", lambda: lower_end(problem, K, H, gain))
     return Certificate(
         gamma=verdict.gamma,
@@ -366,6 +389,17 @@ def certify_at_once(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certi
         verified=f"(17) for a P summed from the gains, and a recursion of few steps: {verdict.arithmetic}",
         margins=verdict.margins,
     )
+
+
+def gain_of(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Gain:
+    """The exact gain as computed in natural units, so that it is the same number in any."""
+    natural = NaturalUnits(problem)
+    return in_units_of(natural.output, exact_gain(model_of_gains(natural.problem, *natural.rounded_there(K, H))))
+
+
+def in_units_of(unit: float, gain: Gain) -> Gain:
+    """What is known of z in units of `unit`, of z itself."""
+    return gain._replace(low=unit * gain.low, high=unit * gain.high)
 
 
 def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) -> float:

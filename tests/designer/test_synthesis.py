@@ -14,6 +14,7 @@ from agent.contract.problem import Problem
 from designer import synthesis
 from designer.lmi import LmiSolution
 from designer.lmi.lmi_design import METHODS
+from designer.model.units import NaturalUnits
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.synthesis import design
@@ -91,7 +92,7 @@ def test_an_answer_that_the_check_does_not_confirm_is_refused(bad: str, monkeypa
 
 def test_an_inaccurate_answer_is_backed_off_until_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     """A P that is a little too large for (17) is lowered, gamma rises by as much, and what is stored holds."""
-    exact = next(METHODS["theorem2-reduced"](find("two-nodes")))
+    exact = next(METHODS["theorem2-reduced"](NaturalUnits(find("two-nodes")).problem))
     rough = exact._replace(R=1.00001 * exact.R, Q=1.00001 * exact.Q, X=1.00001 * exact.X, Y=1.00001 * exact.Y)
     monkeypatch.setitem(synthesis.METHODS, "rough", lambda problem: iter([rough]))
     gains = design(find("two-nodes"), method="rough")
@@ -101,7 +102,7 @@ def test_an_inaccurate_answer_is_backed_off_until_it_holds(monkeypatch: pytest.M
 
 def test_an_answer_that_is_confirmed_near_its_gamma_is_taken_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the solver calls it: optimal_inaccurate is good enough where the check says so."""
-    good = next(METHODS["theorem2-reduced"](find("two-nodes")))
+    good = next(METHODS["theorem2-reduced"](NaturalUnits(find("two-nodes")).problem))
     called_bad = good._replace(solver=good.solver.model_copy(update={"status": "optimal_inaccurate"}))
 
     def made(problem: Problem) -> Iterator[LmiSolution]:
@@ -116,13 +117,13 @@ def test_an_answer_that_is_confirmed_near_its_gamma_is_taken_at_once(monkeypatch
 
 def test_the_best_confirmed_answer_is_kept_where_none_is_near_its_gamma(monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers that are refused, or confirmed far above the LMI's gamma, lead to the next; what was tried is said."""
-    good = next(METHODS["theorem2-reduced"](find("two-nodes")))
+    good = next(METHODS["theorem2-reduced"](NaturalUnits(find("two-nodes")).problem))
     record = SOLVER.model_copy(update={"status": "optimal"})
     refused = good._replace(Y=3.0 * good.Y, solver=SOLVER)
     claims = [good._replace(gamma=share * good.gamma, solver=record) for share in (0.9, 0.8)]
     monkeypatch.setitem(synthesis.METHODS, "made", lambda problem: iter([refused, *claims]))
     gains = design(find("two-nodes"), method="made")
-    assert gains.certificate.lmi_gamma == claims[0].gamma
+    assert gains.certificate.lmi_gamma == NaturalUnits(find("two-nodes")).output * claims[0].gamma
     assert gains.solver.status == "optimal; tried further: made up optimal"
     assert gains.certificate.gamma == pytest.approx(np.sqrt(2.0), rel=1e-4)
 
