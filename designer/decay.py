@@ -32,6 +32,10 @@ _TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to roun
 _STEPS = 30  # in which it is looked for
 _HUGE = 1e150
 _EXACT = 1e-12
+_BALANCED = 150  # states of the errors up to which other units are tried
+_HANDED_ON, _NEAR = 0.1, 1e-4  # in these; by what decays or grows in a state by itself at least
+_ROUNDED_AWAY = 1e10  # of I: Z beyond that has fewer digits than it takes to see what it is
+_RANGE = 500.0  # of logarithms of weights
 _REST = 0.25  # what is left of U may be off by, measured by U
 
 
@@ -57,18 +61,69 @@ def decay(L: Map, modes: int, units: Array, moves: NDArray[np.bool_] | None = No
 
     `moves` (n, n): whether state j ever moves state i, as far as that is known; the radius is the better for it.
     """
-    n, both = len(units), np.outer(units, units)
+    n, scaled = len(units), _in_units(L, units)
+    radius = partial(spectral_radius, scaled, modes, n, moves)
+    total, rest = _total(scaled, modes, n)
+    if n <= _BALANCED and (total is None or not np.abs(total).max() < _ROUNDED_AWAY):
+        others = units * balance(scaled, modes, n)
+        again = _total(_in_units(L, others), modes, n)
+        if again[0] is not None:
+            units, (total, rest) = others, again
+    both = np.outer(units, units)
+    return Decay(None if total is None else total * both, None if rest is None else rest * both, radius)
+
+
+def _in_units(L: Map, units: Array) -> Map:
+    both = np.outer(units, units)
 
     def scaled(Y: Array) -> Array:
         X = L(Y * both) / both
         return np.asarray((X + X.swapaxes(1, 2)) / 2.0)
 
-    total, rest = _total(scaled, modes, n)
-    return Decay(
-        None if total is None else total * both,
-        None if rest is None else rest * both,
-        partial(spectral_radius, scaled, modes, n, moves),
-    )
+    return scaled
+
+
+def balance(L: Map, modes: int, n: int) -> Array:
+    """Units, powers of two, in which no state hands on more than it has to, (n,).
+
+    In a line of states each of which hands on more than it got, Z grows without end along the line, and so does what
+    rounding does to it. N says how the weight of each state alone goes over to others. In these units no entry of it
+    off the diagonal is above the geometric mean of those on the worst circle of several states, or where that is less,
+    above a part of what decays or grows in a state by itself.
+    """
+    N = np.empty((n, n))  # N[j, i]: what of a weight 1 of state i state j has a step earlier
+    for i in range(n):
+        unit = np.zeros((modes, n, n))
+        unit[:, i, i] = 1.0
+        N[:, i] = L(unit).diagonal(axis1=1, axis2=2).max(axis=0)
+    if not np.isfinite(N).all():
+        return np.ones(n)
+    own = float(np.abs(1.0 - N.diagonal()).min())
+    np.fill_diagonal(N, 0.0)
+    with np.errstate(divide="ignore"):
+        onwards = np.log(np.maximum(N, 0.0))
+    most = max(_worst_circle(onwards), np.log(_HANDED_ON * max(own, _NEAR) ** 2))
+    while True:
+        logs = np.zeros(n)
+        for _ in range(n):
+            logs = np.maximum(logs, (onwards - most + logs).max(axis=1))
+        if logs.max() < _RANGE:
+            return np.asarray(np.exp2(np.round((logs - logs.max()) / (2.0 * np.log(2.0)))))
+        most += 1.0
+
+
+def _worst_circle(onwards: Array) -> float:
+    """The largest mean of `onwards` on a circle, by Karp's theorem; -inf where there is none."""
+    n = len(onwards)
+    longest = np.full((n + 1, n), -np.inf)  # of all walks of so many steps that end there
+    longest[0] = 0.0
+    for k in range(n):
+        longest[k + 1] = (onwards + longest[k]).max(axis=1)
+    ends = np.isfinite(longest[n])
+    if not ends.any():
+        return -np.inf
+    means = (longest[n, ends] - longest[:n, ends]) / (n - np.arange(n))[:, None]
+    return float(means.min(axis=0).max())
 
 
 def is_positive(Z: Array) -> bool:

@@ -93,6 +93,47 @@ def test_a_transient_is_not_growth() -> None:
     assert Prover(problem, K, H).stable.holds is True
 
 
+@pytest.mark.parametrize(
+    ("nodes", "own", "onwards", "H", "stable"),
+    [
+        (70, 0.0, 1.4, 0.0, True),
+        (30, 0.95, 1.5, 0.05, True),
+        (60, 0.5, -2.5, 0.1, True),
+        (20, 1.001, 1.5, 0.0, False),
+        (12, 1.01, 3.0, 0.0, False),
+    ],
+)
+def test_a_line_that_hands_on_more_than_it_gets_is_decided(
+    nodes: int, own: float, onwards: float, H: float, stable: bool
+) -> None:
+    """The square of its transient is beyond the digits of a float; in other units there is none."""
+    problem, K, gains_H = chain([0.5] + (nodes - 1) * [own])
+    names = problem.node_names
+    for before, name in pairwise(names):
+        K["t"][name][before] = np.array([[onwards]])
+        gains_H["t"][name][name] = np.array([[H]])
+    problem = Problem.from_document(problem.document() | {"unbiased": False})
+    assert Prover(problem, K, gains_H).stable.holds is stable
+
+
+def test_balanced_units_leave_no_weight_that_is_handed_on() -> None:
+    """Nor do they change what moves itself alone; a circle keeps its mean."""
+    line, circle = chain([0.5] + 9 * [0.3]), np.array([[0.0, 4.0], [1.0, 0.0]])
+    for name, before in zip(line[0].node_names[1:], line[0].node_names, strict=False):
+        line[1]["t"][name][before] = np.array([[40.0]])
+    line = Problem.from_document(line[0].document() | {"unbiased": False}), *line[1:]
+    operator = operator_of(line)
+    units = module.balance(operator.corner, 1, 11)
+    unit = np.zeros((1, 11, 11))
+    unit[0, 10, 10] = units[10] ** 2
+    handed = operator.corner(unit)[0].diagonal() / units**2
+    assert handed[10] == pytest.approx(0.09)
+    assert handed[9] < 0.1
+    found = module.balance(lambda Y: circle.T @ Y @ circle, 1, 2)
+    assert found[0] / found[1] in (1.0, 2.0, 0.5)
+    assert np.array_equal(module.balance(lambda Y: 0.25 * Y, 1, 3), np.ones(3))
+
+
 @pytest.mark.parametrize("own", [0.0, 0.9])
 def test_nor_is_a_long_one(own: float) -> None:
     """In a line of 64 nodes rounding alone makes eigenvalues above 1 of the whole, and so do 300 steps if own = 0.9."""
