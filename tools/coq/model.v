@@ -12,7 +12,7 @@ Record network := Network {
   K : list (list (list matrix)); H : list (list (list matrix)) (* of mode s: at node i, for what node j sends *) }.
 Definition entry {T} (i j : nat) (X : list (list T)) (d : T) : T := nth j (nth i X []) d.
 
-(* Over anything that can be added and multiplied, and is there or 0 by chance: over numbers, once the dice are thrown. *)
+(* Over anything that has sums, multiples, and is there or 0 by chance: over numbers, once chance has decided. *)
 Section Filters.
 Variables (T : Type) (null : T) (plus : T -> T -> T) (by_ : Q -> T -> T) (chance : nat -> T -> T) (f : network).
 Definition add (x y : list T) := map (fun ab => plus (fst ab) (snd ab)) (combine x y).
@@ -33,7 +33,7 @@ Definition node j := nth j (nodes f) (Sensor 0 false 0 [] []).
 Definition chances := map beta (nodes f) ++ concat (rho f).
 Definition sometimes (k : nat) (x : list T) := if Qeq_bool (nth k chances 1) 1 then x else map (chance k) x.
 
-(* The state of everything: x, and the estimate of every node. A node that misses a message takes its own estimate for it. *)
+(* The state: x, and the estimate of every node. A node that misses a message takes its own estimate for it. *)
 Definition state := (list T * list (list T))%type.
 Definition estimate (st : state) j := nth j (snd st) [].
 Definition innovation (st : state) w j :=                                                                 (* (2) *)
@@ -116,12 +116,13 @@ Fixpoint form (P : list (list R)) (x : list R) : R :=
   | (a :: b) :: P', y :: x' => a * y * y + 2 * y * inner b x' + form P' x'
   | [] :: P', _ :: x' => form P' x'
   | _, _ => 0 end.
-Definition V with_x (P : list matrix) s (st : state R) := form (map (map Q2R) (nth s P [])) (eta R Rplus times with_x st).
+Definition V with_x (P : list matrix) s (st : state R) :=
+  form (map (map Q2R) (nth s P [])) (eta R Rplus times with_x st).
 Definition fits f (st : state R) :=
   length (fst st) = n_x f /\ length (snd st) = n f /\ Forall (fun x => length x = n_x f) (snd st).
 Definition zero (x : list R) := Forall (fun y => y = 0) x.
 Definition theorem_1 f (gamma : Q) with_x (P : list matrix) := forall s st, (s < modes f)%nat -> fits f st ->
   (forall w, length w = n_w f -> ~ zero (w ++ eta R Rplus times with_x st) ->
-    expected f s (fun o t => V with_x P t (next f o s st w)) < norm2 w + V with_x P s st) /\                (* (17) *)
+    expected f s (fun o t => V with_x P t (next f o s st w)) < norm2 w + V with_x P s st) /\           (* (17) *)
   (~ zero (eta R Rplus times with_x st) ->
-    norm2 (performance f st) < Q2R gamma * Q2R gamma * V with_x P s st).                                         (* (18) *)
+    norm2 (performance f st) < Q2R gamma * Q2R gamma * V with_x P s st).                                    (* (18) *)

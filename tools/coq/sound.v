@@ -123,37 +123,24 @@ Proof.
       pose proof (Rmult_le_compat (Rabs p) q (2 * Rabs (y * c)) (y * y + c * c)). lra. }
     unfold sum in *. lra.
 Qed.
-Lemma pair_2 : forall a A b B, major a A -> major b B -> forall v,
-  2 * Rabs (inner a v * inner b v) <= sum B * inner A (squared v) + sum A * inner B (squared v).
+Lemma pair_2 : forall a A b B, major a A -> major b B -> forall u v,
+  2 * Rabs (inner a u * inner b v) <= sum B * inner A (squared u) + sum A * inner B (squared v).
 Proof.
-  intros a A b B MA MB. induction MA as [|p q a A E MA IH]; intros v.
-  - simpl. rewrite !Rmult_0_l, Rabs_R0. lra.
-  - assert (G : forall u v, 2 * Rabs (inner a u * inner b v) <= sum B * inner A (squared u) + sum A * inner B (squared v)).
-    { clear IH q p E v. induction MA as [|p q a A E MA IH]; intros u v; [simpl; rewrite !Rmult_0_l, Rabs_R0; lra|].
-      pose proof (major_sum a A MA). pose proof (major_sum b B MB). pose proof (major_inner b B v MB). pose proof (Rabs_pos p).
-      destruct u as [|y u]; simpl; [rewrite Rmult_0_l, Rabs_R0; unfold sum in *; nra|].
-      rewrite Rmult_plus_distr_r. pose proof (Rabs_triang (p * y * inner b v) (inner a u * inner b v)) as T.
-      specialize (IH u v). pose proof (pair_1 b B MB y v) as O.
-      replace (p * y * inner b v) with (p * (y * inner b v)) in * by ring. rewrite Rabs_mult in T.
-      pose proof (Rabs_pos (y * inner b v)). unfold sum in *. nra. }
-    pose proof (major_sum a A MA). pose proof (major_sum b B MB). pose proof (major_inner b B v MB). pose proof (Rabs_pos p).
-    destruct v as [|y v]; [simpl; rewrite Rmult_0_l, Rabs_R0; destruct B; simpl; lra|].
-    cbn [inner]. rewrite Rmult_plus_distr_r.
-    pose proof (Rabs_triang (p * y * inner b (y :: v)) (inner a v * inner b (y :: v))) as T.
-    pose proof (G v (y :: v)) as O1. pose proof (pair_1 b B MB y (y :: v)) as O.
-    replace (p * y * inner b (y :: v)) with (p * (y * inner b (y :: v))) in * by ring. rewrite Rabs_mult in T.
-    pose proof (Rabs_pos (y * inner b (y :: v))). change (squared (y :: v)) with (y * y :: squared v) in *. cbn [inner] in *.
-    unfold sum in *. simpl fold_right. nra.
+  intros a A b B MA MB. induction MA as [|p q a A E MA IH]; intros u v; [simpl; rewrite !Rmult_0_l, Rabs_R0; lra|].
+  pose proof (major_sum a A MA). pose proof (major_sum b B MB). pose proof (major_inner b B v MB). pose proof (Rabs_pos p).
+  destruct u as [|y u]; simpl; [rewrite Rmult_0_l, Rabs_R0; unfold sum in *; nra|].
+  rewrite Rmult_plus_distr_r. pose proof (Rabs_triang (p * y * inner b v) (inner a u * inner b v)) as T.
+  specialize (IH u v). pose proof (pair_1 b B MB y v) as O.
+  replace (p * y * inner b v) with (p * (y * inner b v)) in * by ring. rewrite Rabs_mult in T.
+  pose proof (Rabs_pos (y * inner b v)). unfold sum in *. nra.
 Qed.
 Lemma form_diagonal : forall r v, formQ (diagonal r) v = inner (map Q2R r) (squared v).
 Proof. unfold formQ. induction r as [|q r IH]; intros [|y v]; simpl; auto. rewrite IH. ring. Qed.
-Lemma inner_times : forall q x v, inner (map Q2R (rtimes q x)) v = Q2R q * inner (map Q2R x) v.
-Proof. intros. apply val_times. Qed.
 Lemma shadow_ok : forall x u v, Rabs (val v x * val v u) <= formQ (diagonal (shadow x u)) v.
 Proof.
   intros x u v. rewrite form_diagonal. unfold shadow. change (inner (map Q2R ?r) ?s) with (val s r).
   rewrite val_times, val_plus, !val_times. unfold val.
-  pose proof (pair_2 _ _ _ _ (major_size x) (major_size u) v) as P. pose proof (norm_ok x). pose proof (norm_ok u).
+  pose proof (pair_2 _ _ _ _ (major_size x) (major_size u) v v) as P. pose proof (norm_ok x). pose proof (norm_ok u).
   pose proof (major_inner _ _ v (major_size x)). pose proof (major_inner _ _ v (major_size u)).
   replace (Q2R (1 # 2)) with (/ 2) by (unfold Q2R; simpl; lra). nra.
 Qed.
@@ -392,11 +379,6 @@ Proof.
   induction k as [|k IH]; intros [|row X] [|f b] T1 L; simpl in *; try discriminate; auto.
   apply andb_true_iff in T1 as [R T1]. apply Nat.eqb_eq in R. rewrite rest_row_length by (simpl; lia). simpl.
   injection L as L. rewrite IH by auto. rewrite L. now rewrite Nat.eqb_refl.
-Qed.
-Lemma lowered_triangle : forall k c X, triangle k X = true -> triangle k (lowered c X) = true.
-Proof.
-  induction k as [|k IH]; intros c [|[|a b] X] T; simpl in *; try discriminate; auto.
-  apply andb_true_iff in T as [R T]. rewrite IH by auto. now rewrite R.
 Qed.
 
 Lemma definite : forall k X v, positive_definite k X = true -> length v = k -> ~ zero v -> 0 < form (RZ X) v.
@@ -700,7 +682,7 @@ Proof.
   - specialize (P v u K O). split; [lra | auto].
 Qed.
 
-Lemma nil_eqb : forall (f : network) s, (s < modes f)%nat -> In (nth s (Pi f) []) (Pi f).
+Lemma row_in : forall (f : network) s, (s < modes f)%nat -> In (nth s (Pi f) []) (Pi f).
 Proof. intros. apply nth_In. assumption. Qed.
 Lemma proper_chances : forall f, proper f = true -> forallb probable (chances f) = true /\
   forallb (forallb probable) (Pi f) = true /\ forallb (fun row => negb (Qeq_bool (fold_right Qplus 0%Q row) 0)) (Pi f) = true.
@@ -708,7 +690,7 @@ Proof. intros f P. unfold proper in P. cbv zeta in P. rewrite !andb_true_iff in 
 Lemma total_pos : forall f s, proper f = true -> (s < modes f)%nat -> 0 < total f s.
 Proof.
   intros f s P S. apply proper_chances in P as [_ [A B]]. rewrite forallb_forall in A, B.
-  specialize (A _ (nil_eqb f s S)). specialize (B _ (nil_eqb f s S)). unfold total.
+  specialize (A _ (row_in f s S)). specialize (B _ (row_in f s S)). unfold total.
   assert (E : forall l, Q2R (fold_right Qplus 0%Q l) = sum (map Q2R l)).
   { induction l; simpl; [apply Q2R_0|]. rewrite Q2R_plus, IHl. reflexivity. }
   assert (0 <= sum (map Q2R (nth s (Pi f) []))).
@@ -726,7 +708,7 @@ Qed.
 Lemma entry_pos : forall f s t, proper f = true -> (s < modes f)%nat -> 0 <= Q2R (entry s t (Pi f) 0%Q).
 Proof.
   intros f s t P S. apply proper_chances in P as [_ [A _]]. rewrite forallb_forall in A.
-  specialize (A _ (nil_eqb f s S)). rewrite forallb_forall in A. unfold entry.
+  specialize (A _ (row_in f s S)). rewrite forallb_forall in A. unfold entry.
   destruct (nth_in_or_default t (nth s (Pi f) []) 0%Q) as [I | ->]; [|rewrite Q2R_0; lra]. apply probable_ok; auto.
 Qed.
 Lemma expected_line : forall f s g h c,
@@ -771,8 +753,6 @@ Proof.
   rewrite <- G in M. change (formQ (nth s here []) (etaR x st)) with (V x here s st) in M.
   pose proof (total_pos f s R S). destruct N as [N1 N2]. split; [nra|]. intro Z. specialize (N2 Z). nra.
 Qed.
-Lemma squares_pos : forall f w st, length w = n_w f -> formQ (squares (w_forms f)) (at_ w st) = norm2 w.
-Proof. intros. rewrite form_squares, forms_w; auto. Qed.
 Lemma decide_18_ok : forall f g x P s st, decide_18 f g x P = true -> (s < modes f)%nat -> fits f st ->
   let G := Q2R g * Q2R g * V x P s st in
   norm2 (performance f st) <= G /\ (~ zero (etaR x st) -> norm2 (performance f st) < G).
