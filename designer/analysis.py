@@ -151,9 +151,11 @@ class Analysis(NamedTuple):
                 f"than the one here ({problem.digest()[:12]}...)"
             )
         if self.u is None:
-            known = "NOT mean-square stable, proved: from some start the errors never die out"
-            if self.stable is None:
-                known = "it is not known whether the errors are mean-square stable"
+            known = {
+                True: "mean-square stable, proved, but no gain was found: floats do not resolve it",
+                False: "NOT mean-square stable, proved: from some start the errors never die out",
+                None: "it is not known whether the errors are mean-square stable",
+            }[self.stable]
             lines.append(f"{known}; {self._rate(9)}")
             if self.ladder.floor is None:
                 lines.append("no other gains do better: the sensors do not show an unstable part of the plant")

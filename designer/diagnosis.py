@@ -30,6 +30,7 @@ _NEARLY_UNSTABLE = 0.999
 _RARELY = 0.05  # an arrival or delivery probability below this is worth a word
 _NEVER_QUITE = 1e-6  # a transition probability below this, too
 _SCALES = 1e6
+_EXTREME = 1e100
 _DEPENDENT = 1e-9  # relative to the sizes of A and C: below this, a singular value is 0
 _ONE_BY_ONE = 100  # n nx modes up to which nodes and links are relaxed one by one
 _COMPUTED = "; this is computed, not proved"
@@ -42,7 +43,8 @@ def warnings(problem: Problem) -> list[str]:
 
 
 def refuse_nothing_to_estimate(problem: Problem) -> None:
-    """InputError where z stays 0 whatever w is: M A^k B = 0 for every k."""
+    """InputError where z stays 0 whatever w is: M A^k B = 0 for every k; or where squares are no float64."""
+    _refuse_extremes(problem)
     A, reached, M = problem.plant.A, problem.plant.B, problem.plant.M
     if not M.any():
         raise InputError("plant: M is zero, so there is nothing to estimate; give M a row that is not zero")
@@ -54,6 +56,20 @@ def refuse_nothing_to_estimate(problem: Problem) -> None:
         "plant: no disturbance ever reaches z (M A^k B is zero for every k), so there is nothing to estimate; "
         "give B or M entries that connect them"
     )
+
+
+def _refuse_extremes(problem: Problem) -> None:
+    """Entries of A may be as small as they like: what decays fast between two samples leaves hardly anything."""
+    matrices = [(f"plant: {letter}", getattr(problem.plant, letter)) for letter in "ABM"]
+    matrices += [(f'node "{node.name}": {letter}', getattr(node, letter)) for node in problem.nodes for letter in "CD"]
+    for what, matrix in matrices:
+        sizes = np.abs(matrix[matrix != 0.0])
+        extreme = sizes[(sizes > _EXTREME) | ((sizes < 1.0 / _EXTREME) & (what != "plant: A"))]
+        if len(extreme):
+            raise InputError(
+                f"{what} holds a number of size {extreme[0]:.3g}; designs take sizes from {1.0 / _EXTREME:g} to "
+                f"{_EXTREME:g}, because they work with squares: choose other units"
+            )
 
 
 def refuse_hopeless(problem: Problem) -> None:
@@ -227,6 +243,8 @@ def _too_fast(problem: Problem) -> list[str]:
     found: list[str] = []
     sizes = np.abs(np.linalg.eigvals(_scaled(problem)[0]))
     volume = float(np.prod(sizes[sizes > 1.0]))
+    if volume == 1.0:  # nothing grows
+        return []
     for modes in closed_classes(problem):
         for i, node in enumerate(problem.nodes if len(modes) == 1 else ()):
             rows, beta = len(node.C), node.arrival_probability

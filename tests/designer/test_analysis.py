@@ -16,7 +16,7 @@ from places import ROOT
 from agent.contract.errors import InputError, Unattainable
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
-from designer.analysis import GivenGains, analyse, certified, load_given
+from designer.analysis import GivenGains, analyse, certified, given_plain, load_given
 from designer.cli import main
 from designer.gain.exact import exact_gain
 from designer.model.error_model import error_model, link_gains, stacked_gains
@@ -24,7 +24,7 @@ from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
 from designer.proof.prover import Prover
-from designer.search.starts import ignoring
+from designer.search.starts import ignoring, least_variance_gains
 
 GOLDEN = ROOT / "recordings" / "golden" / "zhu2020-lossy.gains.json"
 Document = dict[str, Any]
@@ -279,3 +279,13 @@ def test_how_many_steps_show_the_lower_end_is_said_where_it_is_known() -> None:
     assert "proved: 1 step shows that it is no less\n" in found._replace(horizon=1, radius=0.5).text()
     assert "proved: 2 steps show that it is no less\n" in found._replace(horizon=2, radius=0.5).text()
     assert "no less" not in found._replace(horizon=2, radius=0.9999).text()
+
+
+def test_what_is_proved_stable_is_not_called_unstable_where_floats_find_no_gain() -> None:
+    """So it is with disturbances whose squares overflow."""
+    problem = find("two-nodes")
+    gains = link_gains(problem, *least_variance_gains(problem))
+    analysis = analyse(problem.with_(plant={"B": [[1e90, 0.0, 0.0]], "M": [[1e90]]}), given_plain(problem, *gains))
+    assert analysis.stable
+    assert "mean-square stable, proved, but no gain was found" in analysis.text()
+    assert "NOT" not in analysis.text()

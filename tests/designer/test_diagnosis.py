@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,10 @@ import numpy as np
 import pytest
 from networks import random_problem, real_network
 
-from agent.contract.errors import Unattainable
+from agent.contract.errors import InputError, Unattainable
 from agent.contract.problem import Problem
 from designer.cli import main
-from designer.diagnosis import closed_classes, explained, obstacles, warnings
+from designer.diagnosis import closed_classes, explained, obstacles, refuse_nothing_to_estimate, warnings
 from designer.problems import find
 from designer.problems.notes import notes
 from designer.proof.hidden import grows_unseen, volume_grows
@@ -442,6 +443,25 @@ def test_that_no_constant_gain_exists_is_said() -> None:
     )
     heard = network(A=A, sees={"1": C, "2": C}, hears=[{"1": ["2"], "2": ["1"]}], beta={"1": 0.46, "2": 0.46})
     assert obstacles(heard) == []
+
+
+def test_a_stable_plant_has_a_solution_however_rarely_measurements_arrive() -> None:
+    assert obstacles(network(A=[[0.9, 0.0], [0.0, 0.5]], sees={"1": [1.0, 0.0]}, hears=[{}], beta={"1": 1e-300})) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"plant": {"B": [[1e101, 0.0]]}}, "plant: B holds a number of size 1e+101"),
+        ({"plant": {"M": [[5e-324]]}}, "plant: M holds a number of size 4.94e-324"),
+        ({"node": {"*": {"D": [[0.0, -1e200]]}}}, 'node "1": D holds a number of size 1e+200'),
+    ],
+)
+def test_numbers_whose_squares_are_none_are_refused(change: dict[str, Any], where: str) -> None:
+    problem = network().with_(**change)
+    for refuses in (lambda: design(problem), lambda: refuse_nothing_to_estimate(problem)):
+        with pytest.raises(InputError, match=f"^{re.escape(where)}; designs take sizes from 1e-100 to 1e"):
+            refuses()
 
 
 def test_whether_a_volume_grows_is_decided_by_balls() -> None:
