@@ -64,6 +64,7 @@ _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _LMI_SECONDS, _LMI_SHARE = 2.0, 0.25  # what that takes, most of it to load; and of a search's time no more
 _AT_ONCE = 2.0  # seconds that starts may take, however little time there is
 _SHARE_OF_NOISE = 0.5  # of a search's time, where least noise is sought after the least peak
+_SECONDS_OF_A_PROOF = 1.0  # that it gets however little time there is
 _STEPS_AT_ONCE, _STEPS_IN_HASTE = 300, 20_000
 _BEYOND, _BEYOND_GAIN, _FURTHER = 0.1, 1e-4, 2.0  # by this part of itself g is higher at first; and so much more then
 _HIGHEST = 1e100
