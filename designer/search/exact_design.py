@@ -386,8 +386,8 @@ def certify_at_once(
 ) -> Certificate:
     """A gamma that a recursion of few steps proves; or Unattainable. `above`: the exact gain, where it is known.
 
-    Where errors decay slowly gamma is above the exact gain, of which nothing is said; but where chance has no say that is
-    known at once.
+    Where errors decay slowly gamma is above the exact gain, of which nothing is said; but where chance has no say that
+    is known at once.
     """
     model = model_of_gains(problem, K, H)
     if Alone.of(model) is not None:
