@@ -124,6 +124,17 @@ class Budget:
         if self.left + self.kept / 2.0 <= 0.0:
             raise TimeIsUp
 
+    def proving(self, seconds: float) -> Look:
+        """In a proof: the same, but all of the time is for it, and so many seconds in any case."""
+        until = self.spent + seconds
+
+        def check(steps: int = 0) -> None:
+            self.check_last(steps)
+            if self.left + self.kept <= 0.0 and self.spent >= until:
+                raise TimeIsUp
+
+        return check
+
     def check_last(self, steps: int = 0) -> None:
         """In what there has to be: KeyboardInterrupt after the second signal; every now and then a word on it."""
         if self.asked > 1:

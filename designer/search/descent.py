@@ -366,8 +366,7 @@ class _Search:
 
     def at_hand(self, starts: Mapping[str, StackedGains]) -> tuple[Candidate, Candidate]:
         """Gains with a bound that takes no recursion, (17) and (18) alone: the first that have one."""
-        offered = self._offered(starts) + [each.v for each in self.stable[-2::-1]]
-        for v in offered:
+        for v in self._offered(starts):
             operator = self.barrier.operator(v)
             P, decays = lyapunov(operator)
             high = math.inf if P is None else least_gamma(operator.M, P) * (1.0 + _SHORT)
@@ -379,9 +378,9 @@ class _Search:
         return found, found
 
     def _offered(self, starts: Mapping[str, StackedGains]) -> list[Array]:
-        """v of what may be best, the likely best first; a search over too few steps may end above its start."""
+        """v of what may be best, the likely best first: a search over too few steps may end above where it was."""
         offered = [] if self.best is None else [self.best[:-1]]
-        offered += [each.v for each in (self.stable[-1:] + self.stable[:1] if len(self.stable) > 1 else self.stable)]
+        offered += [each.v for each in self.stable[::-1]]
         return offered + ([] if self.stable else [self.barrier.entries.pack(*gains) for gains in starts.values()])
 
     def _less(self, least: Candidate, v: Array) -> Candidate:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -63,7 +64,9 @@ _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
 _LMI_SECONDS, _LMI_SHARE = 2.0, 0.25  # what that takes, most of it to load; and of a search's time no more
 _AT_ONCE = 2.0  # seconds that starts may take, however little time there is
 _SHARE_OF_NOISE = 0.5  # of a search's time, where least noise is sought after the least peak
-_STEPS_AT_ONCE, _FIRST_AT_ONCE, _GROWTH_AT_ONCE = 300, 1.1, 1.3  # of a proof at once: g, and how it grows
+_SECONDS_OF_A_PROOF = 1.0  # that it gets however little time there is
+_STEPS_AT_ONCE, _STEPS_IN_HASTE = 300, 20_000
+_BEYOND, _BEYOND_GAIN, _FURTHER = 0.1, 1e-4, 2.0  # by this part of itself g is higher at first; and so much more then
 _HIGHEST = 1e100
 _STATES_OF_BALLS = 40  # n nx up to which they are asked at once
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
@@ -319,11 +322,26 @@ def certify(
 ) -> Certificate:
     """gamma just above the exact gain of any gains of (5), proved; or Unattainable. `gain`: where it is known.
 
-    Where the `budget` is over, the lower end is 0.
+    Where the `budget` is over, the lower end is 0; where it is before gamma is proved, gamma is one that is sooner.
 
     Where M cancels, what is known of it has too few digits; so it may be where the roundings of natural units count,
     and then it is computed with the numbers as they stand.
     """
+    budget = Budget() if budget is None else budget
+    try:
+        with looking(budget.proving(_SECONDS_OF_A_PROOF)):
+            return _near(problem, K, H, gain, budget)
+    except TimeIsUp:
+        above = None if gain is None or not gain.stable else gain.high
+    with suppress(Unattainable):
+        soon = certify_at_once(problem, K, H, above=above, steps=_STEPS_IN_HASTE)
+        budget.left_out.append("a gamma as near to the exact gain as floats find it")
+        return soon
+    return _near(problem, K, H, gain, budget)
+
+
+def _near(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain | None, budget: Budget) -> Certificate:
+    """The same, however long it takes."""
     if Coordinates.of(problem) is None:
         gain = gain_of(problem, K, H) if gain is None else gain
         verdict = confirmed(problem, K, H, gain.high) if gain.stable else None
@@ -347,10 +365,10 @@ def certify(
 
 
 def _certificate(
-    problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, verdict: Verdict, budget: Budget | None
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain, verdict: Verdict, budget: Budget
 ) -> Certificate:
     """With the lower end of the exact gain, where there is time for it."""
-    low = (budget or Budget()).compared("the lower end of the exact gain", lambda: lower_end(problem, K, H, gain))
+    low = budget.compared("the lower end of the exact gain", lambda: lower_end(problem, K, H, gain))
     return Certificate(
         gamma=verdict.gamma,
         kind="exact",
@@ -363,21 +381,27 @@ def _certificate(
     )
 
 
-def certify_at_once(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Certificate:
-    """A gamma that a recursion of few steps proves; or Unattainable.
+def certify_at_once(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, *, above: float | None = None, steps: int = _STEPS_AT_ONCE
+) -> Certificate:
+    """A gamma that a recursion of few steps proves; or Unattainable. `above`: the exact gain, where it is known.
 
-    Where errors decay slowly it is above the exact gain, of which nothing is said; but where chance has no say that is
-    known at once.
+    Where errors decay slowly gamma is above the exact gain, of which nothing is said; but where chance has no say that
+    is known at once.
     """
     model = model_of_gains(problem, K, H)
     if Alone.of(model) is not None:
         return certify(problem, K, H)
     operator = Operator(model)
-    invariant, g = invariant_set(operator), _FIRST_AT_ONCE * horizon_gain(operator, 1)[1]
-    while invariant.P and g < _HIGHEST and not recursion_holds(operator, g, _STEPS_AT_ONCE, invariant=invariant).holds:
-        g *= _GROWTH_AT_ONCE
+    invariant, beyond = invariant_set(operator), _BEYOND if above is None else _BEYOND_GAIN
+    least = horizon_gain(operator, 1)[1] if above is None else above**2
+    while invariant.P and beyond < _HIGHEST:
+        if recursion_holds(operator, least * (1.0 + beyond), steps, invariant=invariant).holds:
+            break
+        beyond *= _FURTHER
     makes = FLOATS + BALLS if problem.n * problem.nx <= _STATES_OF_BALLS else FLOATS
-    verdict = Prover(problem, K, H, makes=makes).exact(math.sqrt(g) * _ABOVE[3], most=2 * _STEPS_AT_ONCE)
+    gamma = math.sqrt(least * (1.0 + beyond)) * _ABOVE[3]
+    verdict = Prover(problem, K, H, makes=makes).exact(gamma, most=2 * steps)
     if not verdict.holds:
         raise Unattainable(f"no gamma of the gains for {problem.name} is proved at once ({verdict.failure})")
     return Certificate(

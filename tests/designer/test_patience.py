@@ -68,6 +68,18 @@ def test_a_search_leaves_time_for_the_choice_that_leaves_time_for_the_proof(
     assert ended_by(budget.check_last) is None
 
 
+def test_a_proof_gets_all_that_was_kept_and_a_little_in_any_case() -> None:
+    budget, clock = budget_of(10.0)
+    budget.keep(4.0)
+    begun = {now: budget.proving(1.0) for clock.now in (0.0, 9.5) for now in [clock.now]}
+    clock.now = 9.9
+    assert ended_by(begun[0.0]) is ended_by(begun[9.5]) is None
+    clock.now = 10.1
+    assert (ended_by(begun[0.0]), ended_by(begun[9.5])) == (TimeIsUp, None)
+    clock.now = 10.6
+    assert ended_by(begun[9.5]) is TimeIsUp
+
+
 def test_searches_share_what_is_left() -> None:
     """The second has all of it."""
     budget, clock = budget_of(10.0)

@@ -262,6 +262,21 @@ def test_a_search_that_comes_to_nothing_in_its_time_is_not_tried(
     assert (found.steps > 0) == (steps > 0)
 
 
+def test_the_best_of_all_stable_gains_on_the_way_is_chosen() -> None:
+    """Not the last ones, where a search over too few steps led away from them."""
+    problem = find("two-nodes")
+    search = descent._Search(problem, Budget(), None)
+    both = least_variance_gains(problem), random_gains(problem, 0, size=0.1)
+    good, bad = (search.barrier.entries.pack(*gains) for gains in both)
+    for v in (bad, good, 1.01 * bad):
+        search._keep(v)
+    search.best = np.append(0.99 * bad, 0.0)
+    least, chosen = search.choose({"bad": both[1]})
+    before = exact_gain(error_model(problem, *both[0]))
+    assert least.gain.high == pytest.approx(before.high, rel=1e-5)
+    assert chosen.gain.high <= descent._SLACK * before.high
+
+
 def test_a_second_thought_while_the_choice_is_made_does_not_lose_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C then comes once more than the search needs it, and the gains are there all the same."""
     problem, pressed = find("two-nodes"), []

@@ -11,13 +11,14 @@ from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
-from designer.model.error_model import error_model
+from designer.model.error_model import error_model, link_gains
 from designer.patience import Budget
 from designer.problems import find
 from designer.proof.certificate import verify
 from designer.proof.findings import Verdict
+from designer.proof.prover import Prover
 from designer.search import descent, effort, exact_design
-from designer.search.exact_design import confirmed, design_exact
+from designer.search.exact_design import certify, confirmed, design_exact
 from designer.search.starts import least_variance_gains
 from designer.search.windows import Windowed
 from designer.synthesis import design
@@ -89,6 +90,27 @@ def test_ctrl_c_while_the_proof_is_made_does_not_lose_the_gains(monkeypatch: pyt
     gains = design_exact(problem, starts={"least variance": least_variance_gains(problem)}, budget=Budget(1e-9))
     assert pressed
     assert verify(gains).holds
+
+
+def test_where_time_is_up_gamma_is_one_that_is_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """True, a little above the exact gain, and said to be; where even that is not found the proof goes to its end."""
+    problem, over = find("two-nodes"), Budget(0.0)
+    K, H = link_gains(problem, *least_variance_gains(problem))
+    gain = exact_gain(error_model(problem, *least_variance_gains(problem)))
+    monkeypatch.setattr(exact_design, "_SECONDS_OF_A_PROOF", 0.0)
+    soon = certify(problem, K, H, budget=over)
+    assert soon.exact is None
+    assert gain.low < soon.gamma < 1.001 * gain.high
+    assert len(over.left_out) == 1
+    assert Prover(problem, K, H).exact(soon.gamma).holds
+
+    def refused(*_: Any, **__: Any) -> Any:
+        raise Unattainable("nothing is proved at once")
+
+    monkeypatch.setattr(exact_design, "certify_at_once", refused)
+    at_length = certify(problem, K, H, budget=over)
+    assert at_length.exact is not None
+    assert at_length.gamma < soon.gamma
 
 
 def test_a_design_by_theorem_2_shows_the_ladder_too() -> None:
