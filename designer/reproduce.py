@@ -174,10 +174,11 @@ def _below(printed: float, optimum: float, least: float | None, agree: str) -> s
     """What is said of a printed gamma below the optimum, which is compared with what is proved, where that is there."""
     misprint = "a misprint is likely, which one we do not know."
     if least is not None and least > printed:
+        bound, solved = rounded_down(least), f"{optimum:.6f}{agree}"
         return (
             f"the printed {printed:g} is {100.0 * (1.0 - printed / least):.1f} % below all that the convex problem "
-            f"(42) can give. That is proved: no point of (42) has less than {rounded_down(least)}; what solvers give as "
-            f"its optimum is {optimum:.6f}{agree}. So {printed:g} cannot come from (42) with the printed data; {misprint}"
+            f"(42) can give. That is proved: no point of (42) has less than {bound}; what solvers give as its "
+            f"optimum is {solved}. So {printed:g} cannot come from (42) with the printed data; {misprint}"
         )
     return (
         f"the printed {printed:g} is {100.0 * (1.0 - printed / optimum):.1f} % below the optimum of the convex problem "
