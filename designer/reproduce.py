@@ -153,30 +153,38 @@ class Reproduced(NamedTuple):
             printed, optimum, scs = values.get("printed"), values.get("clarabel"), values.get("scs")
             if printed is None or optimum is None:
                 continue
-            least, off = values.get("least"), 100.0 * abs(printed / optimum - 1.0)
-            agree = ""
+            least, agree = values.get("least"), ""
             if scs is not None:
                 agree = f", on which two solvers agree within {100.0 * abs(scs / optimum - 1.0):.2f} %"
             if printed < optimum:
-                cannot = "As far as solvers tell, it cannot come from (42) with the printed data"
-                if least is not None and least > printed:
-                    cannot = (
-                        f"That it cannot come from (42) with the printed data is proved: no point of (42) has less "
-                        f"than {rounded_down(least)}"
-                    )
-                said.append(
-                    f"Example {number}: the printed {printed:g} is {off:.1f} % below the optimum of the convex problem "
-                    f"(42){agree}. {cannot}; a misprint is likely, which one we do not know."
-                )
+                said.append(f"Example {number}: {_below(printed, optimum, least, agree)}")
                 found = [value for key in _FOUND if (value := values.get(key)) is not None]
                 if found and min(found) > printed:
                     said.append(f"No gains that we found reach it either: the least of these has {min(found):.4f}.")
             else:
                 said.append(
-                    f"Example {number}: the printed {printed:g} is {off:.1f} % above the optimum of (42){agree}. A "
-                    "solver that was stopped early, or kept a margin, is one way to get it."
+                    f"Example {number}: the printed {printed:g} is {100.0 * (printed / optimum - 1.0):.1f} % above the "
+                    f"optimum of (42) that a solver gives{agree}. A solver that was stopped early, or kept a margin, "
+                    "is one way to get it."
                 )
         return said
+
+
+def _below(printed: float, optimum: float, least: float | None, agree: str) -> str:
+    """What is said of a printed gamma below the optimum, which is compared with what is proved, where that is there."""
+    misprint = "a misprint is likely, which one we do not know."
+    if least is not None and least > printed:
+        bound, solved = rounded_down(least), f"{optimum:.6f}{agree}"
+        return (
+            f"the printed {printed:g} is {100.0 * (1.0 - printed / least):.1f} % below all that the convex problem "
+            f"(42) can give. That is proved: no point of (42) has less than {bound}; what solvers give as its "
+            f"optimum is {solved}. So {printed:g} cannot come from (42) with the printed data; {misprint}"
+        )
+    return (
+        f"the printed {printed:g} is {100.0 * (1.0 - printed / optimum):.1f} % below the optimum of the convex problem "
+        f"(42) that a solver gives{agree}. As far as solvers tell, it cannot come from (42) with the printed data; "
+        f"{misprint}"
+    )
 
 
 def reproduce(
