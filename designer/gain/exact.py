@@ -31,6 +31,7 @@ _LARGE = 900  # n_eta from which that is so
 _WIDTH_OF_NODES = 1e-4
 _UNSTABLE_HORIZON = 30  # where no horizon suffices
 _MOST_STEPS = 20_000
+_TRIALS_AROUND = 4  # on each side of where these do not decide
 _FREED = 3_900_000  # numbers, 31 MB: see `exact_gain`
 
 
@@ -333,9 +334,30 @@ def _bracket(operator: Operator, horizon: int, invariant: InvariantSet | None, w
         elif trial.holds is False:
             low, steps, growth = g, trial.steps, growth * growth
         elif held:
-            break
+            return _around(operator, horizon, invariant, _Bracket(max(low, 0.5 * first), held[-1][0], steps), g)
         g = _next_trial(low, held, width, fit=bool(trial.holds)) if held else growth * g
     return _Bracket(max(low, 0.5 * first), held[-1][0], steps)
+
+
+def _around(
+    operator: Operator, horizon: int, invariant: InvariantSet | None, bracket: _Bracket, undecided: float
+) -> _Bracket:
+    """A narrower bracket around a g at which the recursion has not come to its end: farther away it ends earlier."""
+    (low, high, steps), least, most = bracket, undecided, undecided
+    for _ in range(_TRIALS_AROUND):
+        g = math.sqrt(low * least)
+        trial = recursion_holds(operator, g, horizon, invariant=invariant)
+        if trial.holds is False:
+            low, steps = g, trial.steps
+        else:
+            least = g
+    for _ in range(_TRIALS_AROUND):
+        g = math.sqrt(most * high)
+        if recursion_holds(operator, g, horizon, invariant=invariant).holds:
+            high = g
+        else:
+            most = g
+    return _Bracket(low, high, steps)
 
 
 def _next_trial(low: float, held: list[tuple[float, float]], width: float, *, fit: bool) -> float:

@@ -6,7 +6,7 @@ is small enough for that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -18,7 +18,16 @@ from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_gramian import ByGramian
 from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
-from designer.proof.recursion import MOST_STEPS, Arithmetic, disproof, disproof_by_costs, disproof_by_leaps, recursion
+from designer.proof.recursion import (
+    MOST_STEPS,
+    Arithmetic,
+    disproof,
+    disproof_by_costs,
+    disproof_by_leaps,
+    recursion,
+    seems_below,
+    seen_by_floats,
+)
 from designer.proof.steering import BITS as BITS_OF_COSTS
 from designer.proof.steering import Steering
 from designer.proof.undisturbed import Starts, largest
@@ -120,18 +129,26 @@ class Prover:
             return _verdict(gamma, [_Answer(finding, self.by_gramian.name)])
         if self.P is None:
             return self._no_P(gamma)
-        if self._steering is not None:
-            answers = self._recursion(self.P, gamma, most=min(most, _STEPS_OF_OTHERS), costs=self._steering)
-            if all(proved(answer.findings) for answer in answers):
-                return _verdict(gamma, answers)
-        for P in reversed(self._invariants[1:]):
-            answers = self._recursion(P, gamma, most=min(most, _STEPS_OF_OTHERS))
+        for P, costs in self._endings(gamma, min(most, _STEPS_OF_OTHERS)):
+            answers = self._recursion(P, gamma, most=min(most, _STEPS_OF_OTHERS), costs=costs)
             if all(proved(answer.findings) or refuted(answer.findings) for answer in answers) and len(answers) > 2:
                 return _verdict(gamma, answers)
         answers = self._recursion(self.P, gamma, most=most)
         if len(answers) > 2 or any(refuted(answer.findings) for answer in answers):
             return _verdict(gamma, answers)
         return _verdict(gamma, [*self._disproof(gamma), *answers])
+
+    def _endings(self, gamma: float, most: int) -> Iterator[tuple[Array, Steering | None]]:
+        """Beside the first P, what would end the recursion in so many steps as floats see it, the soonest first."""
+        assert self.P is not None
+        left: list[tuple[Array, Array, Steering | None]] = [(P, P, None) for P in reversed(self._invariants[1:])]
+        if self._steering is not None:
+            left = [(self._steering.P, self.P, self._steering), *left]
+        if left:
+            for Y in seen_by_floats(self._floats, gamma, most):
+                for each in [each for each in left if seems_below(Y, each[0], gamma)]:
+                    left = [other for other in left if other is not each]
+                    yield each[1:]
 
     def _recursion(self, P: Array, gamma: float, *, most: int, costs: Steering | None = None) -> list[_Answer]:
         """(17), P > 0, and where both are proved the recursion with this P."""

@@ -11,6 +11,7 @@ truth shows whether the claim is false.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -93,7 +94,7 @@ def recursion(
     for steps in range(most + 1):
         look(steps)
         if steps == most or steps >= next_look:
-            if _seems_below(arithmetic.floats(Y), bound, gamma):
+            if seems_below(arithmetic.floats(Y), bound, gamma):
                 below = arithmetic.below(Y, P, gamma) if costs is None else costs.ends(Y, gamma)
                 ends = found("Y < g P", modes, below, f" after {steps} steps")
                 if proved(ends):
@@ -120,7 +121,7 @@ def disproof(
     for step in range(1, most + 1):
         look()
         if P is not None and step >= next_look:
-            if _seems_below(arithmetic.floats(Y), P, gamma):
+            if seems_below(arithmetic.floats(Y), P, gamma):
                 break
             next_look = step + 1 + step // 16
         signs, Y = arithmetic.step(Y, gamma, up=False)
@@ -141,7 +142,7 @@ def disproof_by_costs(arithmetic: Arithmetic, modes: Modes, gamma: float, costs:
             u = costs.direction(about, gamma)
             if u is not None and proved(found("", modes, costs.outweighed(Y, gamma, u))):
                 return True
-            if _seems_below(about, costs.P, gamma):
+            if seems_below(about, costs.P, gamma):
                 return False
             next_look = step + 1 + step // 16
         signs, Y = arithmetic.step(Y, gamma, up=False)
@@ -196,7 +197,34 @@ def _at(step: int, gamma: float) -> str:
     return f" at step {step}, counted from the last, with g = gamma^2 = {gamma**2:.6g}"
 
 
-def _seems_below(Y: Array, P: Array, gamma: float) -> bool:
+class Weighing(Protocol):
+    """What floats make of S(Y), without a bound on their rounding."""
+
+    def start(self, *, up: bool) -> Array: ...
+
+    def weigh(self, Y: Array, X: Array) -> Array:
+        """S(Y), (modes, n_eta + nw, n_eta + nw); X says nothing here."""
+
+
+@np.errstate(all="ignore")
+def seen_by_floats(by: Weighing, gamma: float, most: int) -> Iterator[Array]:
+    """Y of the recursion every now and then, as far as it goes in so many steps; a look ahead that proves nothing."""
+    Y, next_look, g = by.start(up=True), 0, gamma**2
+    n = Y.shape[1]
+    for steps in range(most + 1):
+        if steps >= next_look:
+            yield Y
+            next_look = steps + 1 + steps // 16
+        S = by.weigh(Y, Y)
+        W = g * np.eye(S.shape[1] - n) - S[:, n:, n:]
+        try:
+            np.linalg.cholesky(W)
+            Y = S[:, :n, :n] + S[:, :n, n:] @ np.linalg.solve(W, S[:, n:, :n])
+        except np.linalg.LinAlgError:
+            return
+
+
+def seems_below(Y: Array, P: Array, gamma: float) -> bool:
     """Whether Y < g P by Cholesky in floats: a cheap screen, no proof."""
     with np.errstate(all="ignore"):
         rest = gamma**2 * (P + P.swapaxes(1, 2)) / 2.0 - Y

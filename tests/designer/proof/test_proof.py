@@ -572,7 +572,7 @@ def test_17_and_the_end_of_the_recursion_are_what_refuses(
     assert gains.certificate.exact is not None
     gamma, P = 0.5 * gains.certificate.exact[0], lyapunov_matrix(gains)
     P = 1e6 * P if believed == "inequality_17" else P
-    monkeypatch.setattr(recursion_module, "_seems_below", lambda Y, P, gamma: True)
+    monkeypatch.setattr(recursion_module, "seems_below", lambda Y, P, gamma: True)
     assert said(Prover(gains.problem, gains.K, gains.H, P=P, makes=makes).exact(gamma)) == "false"
     for arithmetic in (ByFloats, ByBalls):
         monkeypatch.setattr(arithmetic, believed, lambda self, *given: [balls.Sign(True, False, 1.0)] * 2)
