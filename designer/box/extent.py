@@ -103,6 +103,7 @@ def _tolerance(text: str, size: str, name: str) -> Tolerance:
     if found is None or not found.size or (found.relative and not relative):
         like = "0.02 or 2%" if relative else "0.05"
         limit = "above 0" if math.isinf(most) else "above 0 and at most 1"
+        limit += (", a part at most 100%" if math.isinf(most) else " or 100%") if relative else ""
         raise InputError(f'--within {shortened(text)}: "{size}" is no tolerance; it is {limit}, like {like}')
     return found if found.relative else found._replace(size=Fraction(size))
 
@@ -138,7 +139,12 @@ def asked(problem: Problem, texts: Sequence[str]) -> Box | None:
 
 
 def _text(size: Tolerance) -> str:
-    return f"{float(100 * size.size):g} %" if size.relative else f"{float(size.size):g}"
+    return f"{_shortest(100 * size.size)} %" if size.relative else _shortest(size.size)
+
+
+def _shortest(number: Fraction) -> str:
+    """As it was given."""
+    return repr(float(number)).removesuffix(".0")
 
 
 class _Sizes:

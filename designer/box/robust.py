@@ -58,7 +58,7 @@ class Robust(NamedTuple):
     def lines(self) -> list[str]:
         """For people, below the ladder."""
         lines = [
-            f"box        {self.box.extent}; {self.box.corners} corners; constant, or changing at every step",
+            f"box        {self.box.extent}; {counted(self.box.corners, 'corner')}; constant, or changing at every step",
             *(f"           {remark}" for remark in self.box.remarks()),
         ]
         if self.box.intervals and math.isfinite(self.found):

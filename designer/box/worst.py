@@ -18,10 +18,10 @@ from designer.coordinates import There
 from designer.gain.exact import exact_gain
 from designer.model.error_model import ErrorModel, stacked_links
 from designer.model.mismatch import Real, real_error_model
-from designer.proof.ball_model import Truth
+from designer.proof.ball_model import Truth, told
 from designer.proof.cube import Cube
 
-_WIDTH = 1e-5  # of gamma^2: models are compared by that
+_WIDTH, _CLOSE = 1e-5, 1e-6  # of gamma^2: models are compared by the one, and the worst is told by the other
 _ROUNDS = 3
 _TURNS = 2  # probabilities and entries, each for the others
 
@@ -119,6 +119,8 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
         if not gain > most:
             break
         at, most = _ascent(gain_at, tried, gain, choices[:last])
+    nominal = told(problem)._replace(carry=box.carry)  # which the box holds too
+    most = max(_gain(there, model, width=_CLOSE) for model in (truth(at), nominal)) if math.isfinite(most) else most
     return Worst(truth(at), most, *_corner(at, split, last), tuple(at[last:]))
 
 
@@ -127,8 +129,8 @@ def gain_of(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth:
     return _gain(there_of(problem, K, H, box), truth)
 
 
-def _gain(there: There, truth: Truth) -> float:
-    gain = exact_gain(model_of(there, truth), width=_WIDTH)
+def _gain(there: There, truth: Truth, *, width: float = _WIDTH) -> float:
+    gain = exact_gain(model_of(there, truth), width=width)
     return gain.low if gain.stable else math.inf
 
 

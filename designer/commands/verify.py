@@ -162,7 +162,8 @@ def _whose(gains: Gains, differs: list[str]) -> list[str]:
     if is_another(problem):
         lines.append(f"a problem that is NOT the built-in one of the name {problem.name}")
     if differs:
-        lines.append(f"a problem that differs from the one given in {listed(differs)}, on which no proof depends")
+        found = f"a problem that differs from the one given in {listed(differs)}"
+        lines.append(f"{found}, on which this gamma does not depend")
     return lines
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.contract.arrays import Array
+from agent.contract.errors import counted
 from designer.proof.balls import UNDECIDED, Sign, of_blocks
 from designer.proof.by_floats import square
 from designer.proof.cube import Cube
@@ -48,7 +49,7 @@ class ByVertices:
         self.corners, self.weights, first = corners, weights, corners[0]
         self.mean = np.asarray(weights.mean(axis=0)) if mean is None else mean
         self.order, self.cost = first.order, 3.0 * len(corners)
-        self.name = f"{first.name}, at {len(corners)} corners"
+        self.name = f"{first.name}, at {counted(len(corners), 'corner')}"
 
     def inequality_17(self, P: Array) -> list[Sign]:
         """Not refuted: what is false of something above all models may be true of each."""

@@ -13,6 +13,7 @@ import numpy as np
 from flint import arb, arb_mat, ctx
 
 from agent.contract.arrays import Array
+from agent.contract.errors import counted
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.proof import balls
@@ -115,7 +116,7 @@ class VerticesByBalls(ByBalls):
         T: Array | None = None,
     ) -> None:
         self.bits, self.found = bits, found
-        self.name = f"ball arithmetic of {bits} bits (flint {flint.__version__}), at {len(corners)} corners"
+        self.name = f"ball arithmetic of {bits} bits (flint {flint.__version__}), at {counted(len(corners), 'corner')}"
         with ctx.workprec(bits):
             self.corners = [CubeByBalls(problem, K, H, corner, entries, T) for corner in corners]
         self.model = self.corners[0].model

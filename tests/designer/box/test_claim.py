@@ -19,12 +19,13 @@ from agent.contract.problem.matrices import Matrices
 from designer.analysis import certified, given
 from designer.box import claim
 from designer.box.claim import again, with_claim
-from designer.box.extent import box_in
+from designer.box.extent import box_in, box_of, within
 from designer.box.robust import robust
 from designer.box.worst import real_model
 from designer.cli import main
 from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, ladder_of
+from designer.model.error_model import model_of_gains
 from designer.problems.written import to_toml
 from designer.proof.ball_model import Truth
 
@@ -94,6 +95,16 @@ def test_where_the_file_does_not_say_how_weights_are_made_they_are_sought(
     assert main(["verify", str(edited(tmp_path, **changes, gamma=0.9999 * gamma))]) == 1  # type: ignore[operator]
     monkeypatch.setattr(claim, "robust", lambda *_, **__: again(claimed())._replace(verdict=None))  # type: ignore[union-attr]
     assert main(["verify", str(path)]) == 1
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3])
+def test_the_worst_that_is_found_has_no_less_than_the_model_of_the_file(size: float) -> None:
+    """However near all of the box are to it."""
+    gains = claimed()
+    problem = gains.problem.certain()
+    exact = exact_gain(model_of_gains(problem, gains.K, gains.H))
+    found = robust(problem, gains.K, gains.H, box_of(problem, within([f"A={size}"])))
+    assert exact.low * (1.0 - 1e-6) <= found.found
 
 
 @pytest.mark.parametrize("balls", [[], ["--balls"]])

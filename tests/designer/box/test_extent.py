@@ -21,7 +21,7 @@ from designer.search.starts import ignoring
     ("text", "sentence"),
     [
         ("beta=0.1", "is none of probabilities, transition"),
-        ("probabilities", '"" is no tolerance; it is above 0 and at most 1, like 0.02 or 2%'),
+        ("probabilities", '"" is no tolerance; it is above 0 and at most 1 or 100%, like 0.02 or 2%'),
         ("probabilities=-0.1", '"-0.1" is no tolerance'),
         ("probabilities=nan", '"nan" is no tolerance'),
         ("probabilities=1/0", '"1/0" is no tolerance'),
@@ -36,6 +36,14 @@ def test_what_is_no_tolerance_is_refused(text: str, sentence: str) -> None:
         within([text])
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["A +- 0.4999999", "A +- 1e-09", "C +- 1 %", "B +- 0.1234567 %", "D +- 100 %", "M +- 2"]
+)
+def test_a_box_is_told_as_it_was_asked_for(text: str) -> None:
+    asked = text.replace(" +- ", "=").replace(" ", "")
+    assert box_of(find("two-nodes"), within([asked])).extent == text
 
 
 def test_what_cannot_vary_or_varies_in_too_many_ways_is_refused() -> None:

@@ -95,7 +95,7 @@ def test_no_proof_depends_on_a_name_or_on_the_beginning(folder: Path, capsys: py
         Path("other.toml").write_text(text.replace(changed, by, 1))
         capsys.readouterr()
         assert run("verify", "gains.json", "other.toml") == 0
-        assert f"differs from the one given in {said}, on which no proof depends" in capsys.readouterr().out
+        assert f"differs from the one given in {said}, on which this gamma does not depend" in capsys.readouterr().out
 
 
 def test_of_which_problem_gamma_is() -> None:
