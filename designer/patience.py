@@ -118,19 +118,23 @@ class Budget:
         if self.is_over:
             raise TimeIsUp
 
-    def check_choice(self, steps: int = 0) -> None:
-        """In a choice after the search: half of what was kept is for the proof; a signal does not end it."""
-        self.check_last()
-        if self.left + self.kept / 2.0 <= 0.0:
-            raise TimeIsUp
+    def choosing(self, seconds: float) -> Look:
+        """In a choice after the search: half of what was kept is for the proof; a signal does not end it.
+
+        So many seconds it gets in any case.
+        """
+        return self._after(lambda: self.left + self.kept / 2.0, seconds)
 
     def proving(self, seconds: float) -> Look:
-        """In a proof: the same, but all of the time is for it, and so many seconds in any case."""
+        """In a proof: the same, but all of the time is for it."""
+        return self._after(lambda: self.left + self.kept, seconds)
+
+    def _after(self, left: Callable[[], float], seconds: float) -> Look:
         until = self.spent + seconds
 
         def check(steps: int = 0) -> None:
             self.check_last(steps)
-            if self.left + self.kept <= 0.0 and self.spent >= until:
+            if left() <= 0.0 and self.spent >= until:
                 raise TimeIsUp
 
         return check

@@ -92,8 +92,11 @@ def design(
         if least is None:
             raise
         gains = least
-    if budget.asked > 1 and gains.certificate.exact is None and problem.n * problem.nx <= _PROVED_STATES:
-        ignorant = gains_that_ignore(problem, method, "what was found has none lower that is proved at once", started)
+    cut = method == EXACT and not gains.solver.status.startswith("converged")
+    if (cut or budget.asked > 1) and problem.n * problem.nx <= _PROVED_STATES:
+        ended = gains.solver.status.partition(";")[0]
+        why = f"{ended}, and nothing found by then has a lower gamma that is proved"
+        ignorant = gains_that_ignore(problem, method, why, started)
         gains = min([gains, *([] if ignorant is None else [ignorant])], key=lambda each: each.gamma)
     found = {
         "floor": budget.compared("the floor", lambda: floor_below(problem, gains.certificate.gamma)),

@@ -48,6 +48,7 @@ _LONG = 5000  # steps in which the recursion is to come to its end
 _SLOWER = 0.999  # errors that grow have to grow by so much less at twice the horizon, or the search ends
 _SWEEPS_OF_THE_END = 40  # of the recursion: two exact gains, and a proof
 _DECAYS_OF_THE_END = 10  # and as often it is seen that errors decay, or as long as that takes
+_SECONDS_OF_A_CHOICE = 3.0  # that it gets however little time there is
 _NOTHING = 1e-200  # gamma^2 below this is 0
 _VANISHING = 1e-16  # and so is what falls below this part of what the start had: no network gains so much
 
@@ -356,7 +357,7 @@ class _Search:
         while offered and not least.gain.stable:
             least = self._less(least, offered.pop(0))
         chosen = None
-        with suppress(TimeIsUp), looking(self.budget.check_choice):
+        with suppress(TimeIsUp), looking(self.budget.choosing(_SECONDS_OF_A_CHOICE)):
             for v in offered:
                 if self._may_be_less(v, least):
                     least = self._less(least, v)

@@ -48,7 +48,7 @@ def test_signals_end_what_they_are_enough_for(asked: int, search: Any, compariso
     budget.asked = asked
     assert ended_by(budget.check) is search
     assert ended_by(budget.check_comparison) is comparison
-    assert ended_by(budget.check_choice) is last
+    assert ended_by(budget.choosing(0.0)) is last
     assert ended_by(budget.check_last) is last
 
 
@@ -63,7 +63,7 @@ def test_a_search_leaves_time_for_the_choice_that_leaves_time_for_the_proof(
     budget.keep(4.0)
     clock.now = now
     assert ended_by(budget.check) is search
-    assert ended_by(budget.check_choice) is choice
+    assert ended_by(budget.choosing(0.0)) is choice
     assert ended_by(budget.check_comparison) is comparison
     assert ended_by(budget.check_last) is None
 

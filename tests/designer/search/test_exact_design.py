@@ -94,11 +94,11 @@ def test_ctrl_c_while_the_proof_is_made_does_not_lose_the_gains(monkeypatch: pyt
 
 def test_where_time_is_up_gamma_is_one_that_is_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
     """True, a little above the exact gain, and said to be; where even that is not found the proof goes to its end."""
-    problem, over = find("two-nodes"), Budget(0.0)
+    problem, over = find("two-nodes", ["node.left.arrival_probability=0.9"]), Budget(0.0)
     K, H = link_gains(problem, *least_variance_gains(problem))
     gain = exact_gain(error_model(problem, *least_variance_gains(problem)))
     monkeypatch.setattr(exact_design, "_SECONDS_OF_A_PROOF", 0.0)
-    soon = certify(problem, K, H, budget=over)
+    soon = certify(problem, K, H, gain=gain, budget=over)
     assert soon.exact is None
     assert gain.low < soon.gamma < 1.001 * gain.high
     assert len(over.left_out) == 1
@@ -108,7 +108,7 @@ def test_where_time_is_up_gamma_is_one_that_is_sooner(monkeypatch: pytest.Monkey
         raise Unattainable("nothing is proved at once")
 
     monkeypatch.setattr(exact_design, "certify_at_once", refused)
-    at_length = certify(problem, K, H, budget=over)
+    at_length = certify(problem, K, H, gain=gain, budget=over)
     assert at_length.exact is not None
     assert at_length.gamma < soon.gamma
 
