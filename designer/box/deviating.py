@@ -73,7 +73,10 @@ def ascended(cube: Cube, low: float, start: Deviating | None = None) -> Deviatin
             return at._replace(low=math.inf)
         if g > best.low**2:
             best = at._replace(low=math.sqrt(g))
-        by_D, by_M = _slopes(cube, at, g * (1.0 + _WIDTH + _ABOVE))
+        slopes = _slopes(cube, at, g * (1.0 + _WIDTH + _ABOVE))
+        if slopes is None:
+            break
+        by_D, by_M = slopes
         D, of_M = (size * np.where(by > 0.0, 1.0, -1.0) for size, by in ((radii, by_D), (most, by_M)))
         if (D == at.D).all() and (of_M == at.of_M).all():
             break
@@ -101,10 +104,11 @@ def _recursion(cube: Cube, at: Deviating, g: float) -> Steps | None:
     return back(lambda Y, steps: cube.parts(Y).at(at.D), Y, g, _HORIZON)
 
 
-def _slopes(cube: Cube, at: Deviating, g: float) -> tuple[Array, Array]:
-    """Up to a factor the derivative of gamma by D and by what M is off."""
+def _slopes(cube: Cube, at: Deviating, g: float) -> tuple[Array, Array] | None:
+    """Up to a factor the derivative of gamma by D and by what M is off; None: floats do not see that g is enough."""
     passed = _recursion(cube, at, g)
-    assert passed is not None  # g is above what holds
+    if passed is None:
+        return None
     joint, X = forth(passed.Gamma, passed.W_inverse, lambda joint, k: cube.carried(joint, at.D))
     of_steps = [cube.parts(Y).slope(at.D, joint_k) for Y, joint_k in zip(passed.Y, joint, strict=True)]
     return np.array(of_steps).sum(axis=(0, 1)), cube.peak_parts().slope(at.of_M, X.sum(axis=0))

@@ -21,6 +21,7 @@ from agent.contract.problem import Problem
 from agent.contract.problem.matrices import Matrices, matrices_of
 from agent.contract.problem.uncertainty import Tolerance, tolerance
 from designer.box.rows import Row, row_corners
+from designer.coordinates import Coordinates
 from designer.proof.ball_model import Truth, told
 from designer.proof.deviations import Entry
 
@@ -34,6 +35,12 @@ NAMES = {
 }
 MATRICES = ("A", "B", "C", "D", "M")
 MOST_CORNERS, MOST_ENTRIES, MOST_STATES = 1024, 400, 120
+
+
+_LOST = (
+    "M nearly cancels, which takes digits where entries of matrices may be off: the worst is found less exactly, and "
+    "gamma proved less closely, or not at all"
+)
 
 
 class Interval(NamedTuple):
@@ -55,6 +62,7 @@ class Box(NamedTuple):
     extent: str
     entries: tuple[Entry, ...] = ()
     carry: bool = False  # x feeds the errors of some model, though not those of the file's
+    cancels: bool = False  # M does, and no coordinates help: what is off is one entry in those of the file alone
 
     @property
     def corners(self) -> int:
@@ -63,7 +71,8 @@ class Box(NamedTuple):
 
     def remarks(self) -> list[str]:
         """What the box is not, though it was asked for."""
-        return [f"{part.what} is cut to [{part.low:.6g}, {part.high:.6g}]" for part in self.intervals if part.cut]
+        cut = [f"{part.what} is cut to [{part.low:.6g}, {part.high:.6g}]" for part in self.intervals if part.cut]
+        return [*cut, _LOST] if self.cancels else cut
 
 
 def within(texts: Sequence[str]) -> dict[str, Tolerance]:
@@ -135,7 +144,8 @@ class _Sizes:
 
     def box(self, extent: str, *, where: str) -> Box:
         box = Box(tuple(self._intervals()), tuple(self._rows()), extent, tuple(self._entries()))
-        box = box._replace(carry=self._carries(box))
+        cancels = bool(box.entries) and Coordinates.of(self.problem) is not None
+        box = box._replace(carry=self._carries(box), cancels=cancels)
         if box.corners > MOST_CORNERS:
             raise InputError(
                 f"{where}: the box has {box.corners} corners, of {counted(len(box.intervals), 'probability')} and "

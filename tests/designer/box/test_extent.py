@@ -10,8 +10,11 @@ from made_recordings import random_problem, real_problem
 
 from agent.contract.errors import InputError
 from designer.box.extent import box_in, box_of, corners, within
+from designer.box.robust import robust
 from designer.box.rows import row_corners
+from designer.model.error_model import link_gains
 from designer.problems import find
+from designer.search.starts import ignoring
 
 
 @pytest.mark.parametrize(
@@ -129,6 +132,21 @@ def test_a_tolerance_moves_with_the_value_beside_it() -> None:
         box = box_in(problem.with_(node={"1": {"arrival_probability": value}}))
         assert box is not None
         assert (box.intervals[0].low, box.intervals[0].high) == pytest.approx((value - 0.01, value + 0.02), abs=1e-15)
+
+
+def test_where_m_cancels_it_is_said_of_boxes_of_entries() -> None:
+    """And floats that see no gain of such a model any more are no end of the program."""
+    problem = find("zhu2020-lossy")
+    M = [[1.0, -1.0 - 1e-9, *[0.0] * (problem.nx - 2)]]
+    alike = problem.with_(
+        plant={"A": 0.5 * np.eye(problem.nx), "B": np.full((problem.nx, problem.nw), 0.7), "M": np.array(M)}
+    )
+    for texts, said in ((["D=1%"], True), (["probabilities=0.02"], False)):
+        remarks = box_of(alike, within(texts)).remarks()
+        assert any(remark.startswith("M nearly cancels") for remark in remarks) is said
+    assert not any("cancels" in remark for remark in box_of(problem, within(["D=1%"])).remarks())
+    K, H = link_gains(alike, *ignoring(alike))
+    assert robust(alike, K, H, box_of(alike, within(["D=1%"]))).lines()
 
 
 def test_a_box_of_too_many_corners_is_refused_in_a_problem_too() -> None:
