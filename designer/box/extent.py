@@ -38,8 +38,8 @@ MOST_CORNERS, MOST_ENTRIES, MOST_STATES = 1024, 400, 120
 
 
 _LOST = (
-    "M nearly cancels, which takes digits where entries of matrices may be off: the worst is found less exactly, and "
-    "gamma proved less closely, or not at all"
+    "M nearly cancels, which takes digits where entries of A, B, C or M may be off: the worst is found less exactly, "
+    "and gamma proved less closely, or not at all"
 )
 
 
@@ -68,6 +68,11 @@ class Box(NamedTuple):
     def corners(self) -> int:
         """How many models decide: S(Y)(s) knows one row of Pi alone, so rows of several modes turn together."""
         return int(2 ** len(self.intervals)) * max(len(rows) for rows in self.rows)
+
+    @property
+    def meets_states(self) -> bool:
+        """Whether entries may be off that have to do with the states: other coordinates of these would mix them."""
+        return any(entry.matrix != "D" for entry in self.entries)
 
     def remarks(self) -> list[str]:
         """What the box is not, though it was asked for."""
@@ -144,7 +149,7 @@ class _Sizes:
 
     def box(self, extent: str, *, where: str) -> Box:
         box = Box(tuple(self._intervals()), tuple(self._rows()), extent, tuple(self._entries()))
-        cancels = bool(box.entries) and Coordinates.of(self.problem) is not None
+        cancels = box.meets_states and Coordinates.of(self.problem) is not None
         box = box._replace(carry=self._carries(box), cancels=cancels)
         if box.corners > MOST_CORNERS:
             raise InputError(

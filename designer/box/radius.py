@@ -16,7 +16,7 @@ from designer.box.robust import models_of
 from designer.box.sought import ends, sought
 from designer.box.tail import invariant
 from designer.box.weights import mixed, weights_of
-from designer.box.worst import Worst, gain_of, real_model, there_of, worst
+from designer.box.worst import Worst, gain_of, model_of, there_of, worst
 from designer.gain.exact import Operator
 from designer.proof.ball_model import told
 from designer.proof.by_vertices import ByVertices, prove
@@ -129,7 +129,7 @@ class _Search:
         self.problem, self.K, self.H, self.shape, self.gamma = problem, K, H, shape, gamma
         largest = shape.box(problem, _LARGEST)
         there, truth = there_of(problem, K, H, largest), told(problem)._replace(carry=largest.carry)
-        self.nominal = real_model(there.problem, there.K, there.H, truth)
+        self.nominal = model_of(there, truth)
         self.weights = weights_of(self.nominal, RAISED**2 - 1.0)
         self._worst: Worst | None = None
 

@@ -12,7 +12,7 @@ from agent.contract.problem import Problem
 from designer.box.extent import Box, corners
 from designer.box.sought import begun, sought
 from designer.box.weights import Recipe, moved
-from designer.box.worst import Worst, real_model, there_of, worst
+from designer.box.worst import Worst, model_of, there_of, worst
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
 from designer.proof.ball_model import Truth, told
@@ -153,9 +153,7 @@ def models_of(
     """What stands at the corners, the likely worst first; and models whose worst w makes weights, the nominal last."""
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))
     there = there_of(problem, K, H, box)
-    likely = [
-        real_model(there.problem, there.K, there.H, each) for each in (truth, told(problem)._replace(carry=box.carry))
-    ]
+    likely = [model_of(there, each) for each in (truth, told(problem)._replace(carry=box.carry))]
     return [Cube(problem, K, H, corner, box.entries, there.T) for corner in every], likely
 
 

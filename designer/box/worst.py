@@ -51,8 +51,15 @@ class Worst(NamedTuple):
 
 
 def there_of(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> There:
-    """All as it was where entries of matrices may be off: what is one among the states is none of T x."""
-    return There(problem, K, H, None) if box.entries else There.of(problem, K, H)
+    """All as it was where entries but those of D may be off: what is one among the states is none of T x."""
+    return There(problem, K, H, None) if box.meets_states else There.of(problem, K, H)
+
+
+def model_of(there: There, truth: Truth) -> ErrorModel:
+    """Of [T x; T e], where of the matrices nothing but D is off; else as it was."""
+    if there.T is not None and truth.matrices is not None:
+        truth = truth._replace(matrices=matrices_of(there.problem)._replace(D=truth.matrices.D))
+    return real_model(there.problem, there.K, there.H, truth)
 
 
 def real_model(problem: Problem, K: LinkMatrices, H: LinkMatrices, truth: Truth) -> ErrorModel:
@@ -106,7 +113,7 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
     for _ in range(_TURNS if any(len(options) > 1 for options in choices[:last]) else 1):
         if not (box.entries and math.isfinite(most)):
             break
-        cube = Cube(problem, K, H, truth_at(problem, box, *_corner(at, split, last)), box.entries)
+        cube = Cube(problem, K, H, truth_at(problem, box, *_corner(at, split, last)), box.entries, there.T)
         tried = at[:last] + list(worst_constant(cube, most).signs(cube))
         gain = gain_at(tried)
         if not gain > most:
@@ -121,7 +128,7 @@ def gain_of(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth:
 
 
 def _gain(there: There, truth: Truth) -> float:
-    gain = exact_gain(real_model(there.problem, there.K, there.H, truth), width=_WIDTH)
+    gain = exact_gain(model_of(there, truth), width=_WIDTH)
     return gain.low if gain.stable else math.inf
 
 

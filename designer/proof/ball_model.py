@@ -128,8 +128,9 @@ class BallModel:
             self._turn(T)
 
     def _turn(self, T: Array) -> None:
-        """To T x and T e_i; `sensors` and `carried`, which only boxes ask for, stay as they are."""
+        """To T x and T e_i; `sensors` stay as they are."""
         there, back = exact(T), _inverse(T)
+        self.carried = [[[(rows, there * block) for rows, block in of_j] for of_j in of_s] for of_s in self.carried]
         self.M = self._blocks(self.M, None, back)
         for s in self.modes:
             self.AB[s] = self._blocks(self.AB[s], there, back)
@@ -141,8 +142,10 @@ class BallModel:
     def _turned(self, noise: Noise, there: arb_mat, back: arb_mat) -> Noise:
         """E is the identity where a whole message is lost, and then stays it: what T makes small is C."""
         C = noise.C * self._along(noise.columns, back)
+        along = self._along(noise.rows, there)
+        noise = noise._replace(carried=along * noise.carried)
         if noise.loss:
-            return noise._replace(E=self._along(noise.rows, there) * noise.E, C=C)
+            return noise._replace(E=along * noise.E, C=C)
         return noise._replace(C=there * C)
 
     def _blocks(self, matrix: arb_mat, left: arb_mat | None, right: arb_mat) -> arb_mat:

@@ -179,7 +179,7 @@ class Cube(ByFloats):
         T: Array | None = None,
     ) -> None:
         self.truth, self.T, self.entries = truth, T, entries
-        if entries and T is not None:
+        if T is not None and any(entry.matrix != "D" for entry in entries):
             raise ValueError("an entry that is off is one of the matrices as they are, not of those that T makes")
         with ctx.workprec(BITS):
             balls = BallModel(problem, K, H, truth, T)

@@ -350,7 +350,7 @@ def test_where_nothing_cancels_the_LMI_is_solved_as_ever() -> None:
 @pytest.fixture(scope="module")
 def boxed() -> tuple[Problem, LinkMatrices, LinkMatrices, Box]:
     problem = cancelling(1e-10)
-    return problem, *good_gains(problem), box_of(problem, within(["probabilities=0.001"]))
+    return problem, *good_gains(problem), box_of(problem, within(["probabilities=0.001", "D=0.1%"]))
 
 
 def test_a_box_of_probabilities_is_proved_where_M_cancels(

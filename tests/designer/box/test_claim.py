@@ -83,7 +83,7 @@ def test_balls_prove_the_same_claim() -> None:
     assert "ball arithmetic" in found.verdict.arithmetic  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("changes", [{"rounds": []}, {"rounds": [], "signs": [1, -1, 1], "ends": [True]}, {"start": 7}])
+@pytest.mark.parametrize("changes", [{"rounds": []}, {"rounds": [], "signs": [1, -1, 1], "ends": [True]}])
 def test_where_the_file_does_not_say_how_weights_are_made_they_are_sought(
     changes: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
