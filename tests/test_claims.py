@@ -18,7 +18,7 @@ HELP = {  # what a command or an option is for
     "prove a certificate again, without a solver",
     "gains with a certificate, for a problem",
     "write them as a gains file, their exact gain certified",
-    "the largest such boxes for which 1.05 gamma is proved, of all shapes; small networks have them anyway",
+    "the largest boxes for which 1.05 gamma is proved, of all shapes; small networks have some anyway",
     "no gains, but a table: the certified gamma with each node and each link left out in turn",
     "the paper's two examples: printed beside computed (a minute or two)",
 }

@@ -83,7 +83,7 @@ class Radius(NamedTuple):
 def radii(problem: Problem, K: LinkMatrices, H: LinkMatrices, gamma: float, *, dear: bool = True) -> list[Radius]:
     """Of every shape in which something of the problem may vary; gamma is proved for the problem itself.
 
-    Without `dear` only of those shapes that take a few seconds.
+    Without `dear` only of those shapes that take a second or so, and less closely.
     """
     found = []
     for shape in SHAPES[:-1] if problem.plant.spectral_radius < 1.0 else (*SHAPES[:2], SHAPES[-1]):
@@ -93,7 +93,7 @@ def radii(problem: Problem, K: LinkMatrices, H: LinkMatrices, gamma: float, *, d
             continue
         if not dear and (problem.n > _FEW_NODES or _work(problem, box) > _LITTLE):
             continue
-        found.append(_radius(problem, K, H, shape, gamma * RAISED))
+        found.append(_radius(problem, K, H, shape, gamma * RAISED, dear=dear))
     return found
 
 
@@ -102,10 +102,12 @@ def _work(problem: Problem, box: Box) -> float:
     return float(box.corners * len(problem.topologies) * order**3)
 
 
-def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> Radius:
-    """As far as weights of the nominal model lead; from there as a box that is given is looked at; then proved."""
+def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float, *, dear: bool) -> Radius:
+    """As far as weights of the nominal model lead; if `dear` from there as a box that is asked for; then proved."""
     search = _Search(problem, K, H, shape, gamma)
-    low, high = search.further(*search.coarse())
+    low, high = search.coarse()
+    if dear:
+        low, high = search.further(low, high)
     while low and not ((found := search.attempt(low)) and prove(found.by, problem.mode_names, gamma, found.P).holds):
         low, high = low - 1, low
     return Radius(shape, gamma, float(_size(low)), float(_size(high)) if high <= _PARTS else None)

@@ -42,7 +42,7 @@ def add_analyse(commands: Subcommands) -> None:
     analyse.add_argument(
         "--radius",
         action="store_true",
-        help="the largest such boxes for which 1.05 gamma is proved, of all shapes; small networks have them anyway",
+        help="the largest boxes for which 1.05 gamma is proved, of all shapes; small networks have some anyway",
     )
     analyse.add_argument("--force", action="store_true", help="replace that file if it exists")
     add_table(analyse, "the ladder")
