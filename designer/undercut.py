@@ -76,7 +76,8 @@ def _by_weights(problem: Problem, offered: Weights | None, seconds: float) -> Un
         return Undercut(None, why_not=why)
     found = Undercut(None, why_not="no weights have anything to spare")
     for seen in (_seen(problem, at_first) for at_first in _AT_FIRST):
-        found = found if seen is None else _seen_so(problem, seen, offered, seconds)
+        if seen is not None and np.isfinite(seen.T).all():
+            found = _seen_so(problem, seen, offered, seconds)
         if found.gamma is not None:
             break
     return found
