@@ -20,6 +20,7 @@ from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
 from designer.lmi import conic, decomposed
 from designer.lmi.attempts import SOLVED
+from designer.lmi.cones import Indices
 from designer.model.units import NaturalUnits, Units
 from designer.patience import look
 from designer.proof.least import at_least
@@ -29,7 +30,8 @@ from designer.search.effort import in_words
 from designer.search.starts import Greedy
 
 _KEPT, _APART = 0.3, 0.3  # of moments in each step; and of those of each error once more, but of no two together
-_STEPS, _SETTLED, _BOUNDLESS = 300, 1e-7, 1e100
+_AT_FIRST = (1e-3, 0.0)  # of them: errors that feed themselves are there or not, and either may have more to spare
+_STEPS, _SETTLED, _BOUNDLESS = 300, 1e-5, 1e100
 _NOTHING = 1e-9  # of the largest moments: w does not reach this error in this mode
 _SPARE = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)  # of the weights, those that have much to spare
 _DIGITS = 3  # of the weights in a file, more than that part has
@@ -72,9 +74,16 @@ def _by_weights(problem: Problem, offered: Weights | None, seconds: float) -> Un
     if numbers > decomposed.MOST_WEIGHTS:
         why = f"it takes {numbers} weights, and a file keeps at most {decomposed.MOST_WEIGHTS}"
         return Undercut(None, why_not=why)
-    seen = _seen(problem)
-    if seen is None:
-        return Undercut(None, why_not="no weights have anything to spare")
+    found = Undercut(None, why_not="no weights have anything to spare")
+    for seen in (_seen(problem, at_first) for at_first in _AT_FIRST):
+        if seen is not None and np.isfinite(seen.T).all():
+            found = _seen_so(problem, seen, offered, seconds)
+        if found.gamma is not None:
+            break
+    return found
+
+
+def _seen_so(problem: Problem, seen: _Seen, offered: Weights | None, seconds: float) -> Undercut:
     V = None if offered is None else _moved(problem, offered, seen.T)
     found = Undercut(None) if V is None else _mixed(problem, seen, V, most=_LITTLE)
     if found.gamma is not None:
@@ -93,11 +102,23 @@ def _by_weights(problem: Problem, offered: Weights | None, seconds: float) -> Un
 def _solved(problem: Problem, seen: _Seen, lmi: decomposed.Lmi) -> Undercut:
     objective = np.zeros(lmi.cones.A.shape[1])
     objective[lmi.delta] = 1.0
-    answer = conic.clarabel(lmi.cones, objective)
+    answer = conic.clarabel(lmi.cones.without(_unreached(seen, lmi)), objective)
     if answer.record.status not in SOLVED or answer.z is None:
         return Undercut(None, why_not=f"a solver says {answer.record.status} of the LMI")
     units = Units(np.ones(seen.problem.nx), 1.0)
     return _mixed(problem, seen, decomposed.multipliers(seen.problem, lmi, answer.z, units))
+
+
+def _unreached(seen: _Seen, lmi: decomposed.Lmi) -> dict[int, Indices]:
+    """The rows of the balance on errors that w does not reach, of the inequalities of these numbers."""
+    r, p, found = seen.problem.nx, seen.problem.plant_states, dict[int, Indices]()
+    for s, mode in enumerate(lmi.modes):
+        live = seen.spare[s].any(axis=1)
+        for piece in mode.balance:
+            dead = [piece.at[v][:r] for v in piece.at if v and not live[p + (v - 1) * r : p + v * r].any()]
+            if dead:
+                found[piece.matrix.number] = np.concatenate(dead)
+    return found
 
 
 def _moved(problem: Problem, weights: Weights, T: Array) -> Array | None:
@@ -131,7 +152,7 @@ def _mixed(problem: Problem, seen: _Seen, V: Array, *, most: float = math.inf) -
     return Undercut(None, why_not="no weights were found that prove any")
 
 
-def _seen(problem: Problem) -> _Seen | None:
+def _seen(problem: Problem, at_first: float) -> _Seen | None:
     """From where nothing cancels in M; and where nothing does in the problem, all errors are about as large."""
     reduced, T = on_reachable(problem)
     if reduced is None:
@@ -139,7 +160,7 @@ def _seen(problem: Problem) -> _Seen | None:
     coordinates = Coordinates.of(reduced)
     natural = NaturalUnits(reduced, coordinates)
     near, T = natural.problem, (T if coordinates is None else coordinates.T @ T) / natural.state[:, None]
-    spare = _spare(near)
+    spare = _spare(near, at_first)
     if spare is None or coordinates is not None:  # T as it is has nothing to do with rounding
         return None if spare is None else _Seen(near, T, spare)
     S = _near_1(near, spare)
@@ -170,25 +191,27 @@ def _turned(problem: Problem, S: Array) -> Problem:
     return problem.model_copy(update={"plant": plant.model_copy(update=matrices), "nodes": nodes})
 
 
-def _spare(problem: Problem) -> Array | None:
+def _spare(problem: Problem, at_first: float) -> Array | None:
     """Of [x; e] what white w leaves of it, 0 where that is next to nothing; None where it grows without end.
 
-    In every mode each e_i is as large as its best gains leave it, times _KEPT + _APART < 1: so much is to spare.
+    It begins with `at_first`. In every mode each e_i is as large as its best gains leave it, times _KEPT + _APART < 1:
+    so much is to spare.
     """
     greedy, modes, w = Greedy(problem), len(problem.topologies), problem.nw
     size = problem.plant_states + problem.n * problem.nx
     blocks = np.kron(np.eye(size // problem.nx), np.ones((problem.nx, problem.nx)))
-    joint, X = np.zeros((modes, size + w, size + w)), np.zeros((modes, size, size))
+    joint, X = np.zeros((modes, size + w, size + w)), at_first * np.tile(np.eye(size), (modes, 1, 1))
     joint[:, size:, size:] = np.eye(w) / modes
     for _ in range(_STEPS):
         look()
         joint[:, :size, :size] = X
         arrived = greedy.operator(*greedy.gains(joint)).carry(joint)
         X_next = (_KEPT + _APART * blocks) * (arrived + arrived.swapaxes(1, 2)) / 2.0
-        change, X = np.abs(X_next - X).max(), X_next
-        if not change < _BOUNDLESS:
+        before, now = (np.diagonal(moments, axis1=1, axis2=2) for moments in (X, X_next))
+        X = X_next
+        if not now.max() < _BOUNDLESS:
             return None
-        if change <= _SETTLED * np.abs(X).max():
+        if (np.abs(now - before) <= np.maximum(_SETTLED * now, _NOTHING * now.max())).all():
             break
     sizes = np.trace(X.reshape(modes, -1, problem.nx, size // problem.nx, problem.nx), axis1=2, axis2=4)
     live = np.repeat(np.diagonal(sizes, axis1=1, axis2=2) > _NOTHING * sizes.max(), problem.nx, axis=1)

@@ -31,6 +31,20 @@ class Cones(NamedTuple):
         first, order = sum(sizes[:number]), self.orders[number]
         return _matrix(z[first : first + sizes[number]], order)
 
+    def without(self, dropped: dict[int, Indices]) -> Cones:
+        """With nothing asked of these rows and columns of the inequalities of these numbers: in `piece` they are 0."""
+        A, b = self.A.tolil(), self.b.copy()
+        first = 0
+        for number, order in enumerate(self.orders):
+            columns, rows = np.tril_indices(order)
+            at = dropped.get(number, np.zeros(0, dtype=np.int64))
+            left_out = np.flatnonzero(np.isin(rows, at) | np.isin(columns, at))
+            for k in left_out:
+                A.rows[first + k], A.data[first + k] = [], []
+                b[first + k] = float(rows[k] == columns[k])
+            first += order * (order + 1) // 2
+        return Cones(scipy.sparse.csc_matrix(A), b, self.orders)
+
 
 class Assembly:
     """Hands out unknowns and inequalities; `cones` puts the inequalities together."""

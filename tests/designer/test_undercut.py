@@ -97,3 +97,15 @@ def test_where_M_cancels_the_optimum_is_enclosed_too(eps: float, plant: dict[str
     gains = design(problem, method="decomposed")
     assert gains.certificate.lmi_least == pytest.approx(optimum, rel=1e-3)
     assert least_again(gains) == BY_WEIGHTS
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        pytest.param(random_problem(41, n=3, nx=2, nw=1), id="w is known to some, and to others where all arrives"),
+        pytest.param(random_problem(44, n=2, nx=2, nw=2, lossy=False), id="an error that w can only feed"),
+    ],
+)
+def test_errors_that_gains_can_keep_free_of_w_are_left_out_of_the_balance(problem: Problem) -> None:
+    """Or not, where w feeds what there is of them."""
+    assert undercut(problem).gamma == pytest.approx(decomposed.solve(problem).gamma, rel=1e-3)

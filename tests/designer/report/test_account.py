@@ -21,6 +21,7 @@ from designer.proof.prover import Prover
 from designer.report.account import Account, over_nodes
 from designer.single_run import least_of_P, single_run
 from designer.synthesis import design
+from designer.undercut import undercut
 
 GOLDEN_RUN = GOLDEN / "zhu2020-lossy.mcap"
 
@@ -152,3 +153,16 @@ def test_without_a_matrix_nothing_is_said_of_single_runs(tmp_path: Path, exact: 
     turned = exact.certificate.model_copy(update={"form": "full", "P": {"linked": -P[0]}})
     assert single_run(exact.model_copy(update={"certificate": turned})) is None
     assert account_of(tmp_path).verdict.chance is None
+
+
+def test_the_rung_of_the_lmi_is_there_where_the_weights_of_the_gains_prove_it(tmp_path: Path) -> None:
+    """And not where they prove less than is claimed."""
+    golden = Gains.load(GOLDEN / "zhu2020-lossy.gains.json")
+    found = undercut(golden.problem)
+    assert found.gamma is not None
+    for number, (claimed, there) in enumerate([(found.gamma, True), (found.gamma * (1.0 + 1e-6), False)]):
+        claim = golden.certificate.model_copy(update={"lmi_least": claimed, "lmi_weights": found.weights})
+        gains = golden.model_copy(update={"certificate": claim})
+        path = record(tmp_path / f"run-{number}.mcap", gains, simulate(gains, steps=10), steps=10)
+        rungs = dict(Account.of(path).rungs)
+        assert rungs.get("proved: no gains have less by Theorem 2") == (claimed if there else None)
