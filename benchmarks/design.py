@@ -43,14 +43,10 @@ from agent.contract.gains import Gains
 from benchmarks.design import network
 from designer.proof.certificate import verify
 from designer.patience import Budget
-from designer.search.exact_design import design_exact
 from designer.synthesis import design
 problem, budget = network(sys.argv[2], seed=int(sys.argv[3])), float(sys.argv[4])
 started, cpu = time.perf_counter(), time.process_time()
-if sys.argv[1] == "exact":
-    gains = design_exact(problem, budget=Budget(budget, clock=time.process_time))
-else:
-    gains = design(problem, method=sys.argv[1])
+gains = design(problem, method=sys.argv[1], budget=Budget(budget, clock=time.process_time))
 whole, cpu = time.perf_counter() - started, time.process_time() - cpu
 started, proved = time.process_time(), gains.certificate
 assert verify(Gains.from_bytes(gains.canonical(), source="memory")).holds

@@ -15,6 +15,7 @@ from designer.gain.exact import exact_gain
 from designer.gain.floor import floor
 from designer.ladder import as_table, rounded_down, rounded_up
 from designer.model.error_model import StackedGains, error_model
+from designer.model.units import NaturalUnits
 from designer.problems import find
 from designer.search.starts import consensus_gains, least_variance_gains
 
@@ -55,15 +56,16 @@ class Computed:
 
     @cached_property
     def consensus(self) -> float | None:
-        return self._exact_of(consensus_gains(self.problem))
+        return self._exact_of(consensus_gains)
 
     @cached_property
     def least_variance(self) -> float | None:
-        return self._exact_of(least_variance_gains(self.problem))
+        return self._exact_of(least_variance_gains)
 
-    def _exact_of(self, gains: StackedGains) -> float | None:
-        bounds = exact_gain(error_model(self.problem, *gains)).bounds
-        return None if bounds is None else bounds[1]
+    def _exact_of(self, gains: Callable[[Problem], StackedGains]) -> float | None:
+        natural = NaturalUnits(self.problem)
+        bounds = exact_gain(error_model(natural.problem, *gains(natural.problem))).bounds
+        return None if bounds is None else natural.output * bounds[1]
 
     def _designed(self, method: str) -> Gains:
         from designer.synthesis import design
