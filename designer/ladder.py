@@ -63,7 +63,7 @@ class Ladder(NamedTuple):
         rungs = [
             (FLOOR, self.floor),
             (NOMINAL, self.nominal_exact),
-            (EXACT, self.exact and self.exact[1]),
+            (EXACT, self.exact[1] if self.exact is not None and self.knows_exact else None),
             (CERTIFIED, self.gamma),
             (f"exact gain of {self.lmi}'s gains", self.theorem2_exact and self.theorem2_exact[1]),
             (self.least_of_lmi, self.theorem2_least),
@@ -74,7 +74,12 @@ class Ladder(NamedTuple):
             (NOMINAL_IN_BOX, self.nominal_in_box),
         ]
         there = [(name, value) for name, value in rungs if value is not None]
-        return sorted(there, key=lambda rung: (rung[0] != FLOOR, rung[1]))
+        return sorted(there, key=lambda rung: (rung[0] != FLOOR, float(rung_text(*rung))))  # as they are read
+
+    @property
+    def knows_exact(self) -> bool:
+        """Whether both ends of the exact gain are known: a lower end of 0 is one that was left out, or says nothing."""
+        return self.exact is not None and (self.exact[0] > 0.0 or self.exact[1] == 0.0)
 
     @property
     def least_of_lmi(self) -> str:
@@ -98,7 +103,7 @@ class Ladder(NamedTuple):
         texts = [(rung_text(name, value), name + remarked.get(name, "")) for name, value in self.rungs()]
         width = max((len(value) for value, _ in texts), default=0)
         lines = [f"{value:{width}}  {name}" for value, name in texts]
-        if self.exact is None and self.gamma is not None:
+        if not self.knows_exact and self.gamma is not None:
             lines.append(f"{'-':{width}}  {EXACT}: not computed; analyse does")
         if self.theorem2_why_not is not None:
             lines.append(f"{'-':{width}}  what no gains are below by {self.lmi}: not proved; {self.theorem2_why_not}")

@@ -14,7 +14,7 @@ from agent.contract.errors import InputError
 from agent.contract.problem import Problem
 from benchmarks.design import banded
 from designer.cli import main
-from designer.ladder import Ladder, ladder_of, percent, rounded_up
+from designer.ladder import Ladder, ladder_of, percent, rounded_up, rung_text
 from designer.problems import find, names
 from designer.search.effort import (
     BUDGET,
@@ -77,7 +77,8 @@ def test_both_of_a_designs_proved_gammas_are_rungs() -> None:
     ]
     assert lines[2].startswith(rounded_up(proved.gamma))
     assert lines[5].startswith(rounded_up(proved.theorem1_gamma))
-    assert [value for _, value in ladder_of(gains).rungs()] == sorted(value for _, value in ladder_of(gains).rungs())
+    values = [float(rung_text(*rung)) for rung in ladder_of(gains).rungs()]
+    assert values == sorted(values)
 
 
 def test_what_is_not_there_is_not_said() -> None:
@@ -90,6 +91,17 @@ def test_what_is_not_there_is_not_said() -> None:
     assert Ladder(0.5, None, 1.0, None, 1.0).lines()[1] == "1.000000  gamma, certified: 100.0 % above the floor"
     assert Ladder(None, (0.9, 1.0), None, None, None).lines() == ["1.000000  exact gain of these gains"]
     assert Ladder(1e-12, (0.9, 1.0), None, None, None).above_floor is None
+    upper_end_alone = Ladder(0.0, (0.0, 1.0), 1.0, None, None)  # below it nobody has looked
+    assert upper_end_alone.lines() == Ladder(0.0, None, 1.0, None, None).lines()
+
+
+def test_rungs_stand_as_they_are_read() -> None:
+    """A solver may stop a hair below what is proved, which is rounded down to where it is below the solver's."""
+    ladder = Ladder(0.0, None, 0.2, None, 0.34797423, theorem2_least=0.34797427)
+    assert ladder.lines()[2:4] == [
+        "0.347974  proved: no gains have less by Theorem 2",
+        "0.347975  Theorem 2's bound, as a solver gave it",
+    ]
 
 
 def test_numbers_of_different_length_stand_in_one_column() -> None:
