@@ -342,7 +342,8 @@ def certify(
 
 def _near(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain | None, budget: Budget) -> Certificate:
     """The same, however long it takes."""
-    if Coordinates.of(problem) is None:
+    alone = Alone.of(model_of_gains(problem, K, H)) is not None  # which other units may round away
+    if Coordinates.of(problem) is None and not alone:
         gain = gain_of(problem, K, H) if gain is None else gain
         verdict = confirmed(problem, K, H, gain.high) if gain.stable else None
         if verdict is not None and verdict.holds:
