@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 PROVED = {
     "lyapunov": "mean-square stability, and gamma by (17) and (18) of Theorem 1 in every mode",
     "exact": "mean-square stability by (17), and gamma by the recursion of the exact gain",
+    "gramian": "that the errors die out, and gamma by their gramian, since chance has no say",
 }
 _ANSWERS = {True: "proved", False: "false", None: "open"}
 _BESIDE = {"name", "disturbance", "tolerance", "initial", "initial_error"}  # what a proof of gamma does not depend on
@@ -72,7 +73,7 @@ def verify_command(options: argparse.Namespace) -> int:
     seconds, claim = time.perf_counter() - started, gains.certificate
     within = "" if in_box is None or in_box.verdict is None else in_box.verdict.arithmetic
     how = "; ".join(dict.fromkeys(part for part in (verdict.arithmetic, within, f"{seconds:.2f} s") if part))
-    proved = [PROVED[claim.kind]]
+    proved = [PROVED["gramian" if verdict.by_gramian else claim.kind]]
     if claim.theorem1_gamma is not None:
         proved.append(f"gamma = {claim.theorem1_gamma} too, by (17) and (18) of Theorem 1 for the same P")
     if least is not None and least.holds:

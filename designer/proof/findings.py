@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from designer.proof.balls import Sign
 
+GRAMIAN = "M G M' < g"  # what decides where chance has no say
+
 
 class Verdict(NamedTuple):
     """Whether what is claimed is proved; where it is not, the inequality that fails, and by how much."""
@@ -17,6 +19,11 @@ class Verdict(NamedTuple):
     margins: dict[str, float]  # of each inequality and mode: the least eigenvalue after scaling; not proved: <= 0
     low: float | None = None  # the exact gain is not below it, which is proved too; None: nobody said, or it is not
     interval_is_false: bool = False  # gamma is proved, and an end that was claimed of the exact gain proved false
+
+    @property
+    def by_gramian(self) -> bool:
+        """Whether chance has no say, so that there was neither a P nor a recursion."""
+        return any(name.startswith(GRAMIAN) for name in self.margins)
 
     def joined(self, other: Verdict) -> Verdict:
         """Both, with this one's gamma."""

@@ -17,7 +17,7 @@ from designer.coordinates import Coordinates
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_gramian import ByGramian
-from designer.proof.findings import Finding, Verdict, failure, found, margins, proved, refuted
+from designer.proof.findings import GRAMIAN, Finding, Verdict, failure, found, margins, proved, refuted
 from designer.proof.recursion import (
     MOST_STEPS,
     Arithmetic,
@@ -125,7 +125,7 @@ class Prover:
         """(17), and the recursion until Y < g P, which it comes to within `most` steps."""
         if self.by_gramian is not None:
             modes, sign = self._problem.mode_names, self.by_gramian.sign(gamma)
-            finding = found("M G M' < g", modes, [sign] * len(modes))
+            finding = found(GRAMIAN, modes, [sign] * len(modes))
             return _verdict(gamma, [_Answer(finding, self.by_gramian.name)])
         if self.P is None:
             return self._no_P(gamma)

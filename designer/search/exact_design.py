@@ -69,6 +69,8 @@ _STEPS_AT_ONCE, _STEPS_IN_HASTE = 300, 20_000
 _BEYOND, _BEYOND_GAIN, _FURTHER = 0.1, 1e-4, 2.0  # by this part of itself g is higher at first; and so much more then
 _HIGHEST = 1e100
 _STATES_OF_BALLS = 40  # n nx up to which they are asked at once
+_RECURSION = "(17) for a P summed from the gains, and the recursion of the exact gain"
+_GRAMIAN = "M G M' < gamma^2 for the gramian G, since chance has no say"
 _ABOVE = (1.0, 1.0 + 1e-9, 1.0 + 1e-8, 1.0 + 1e-7, 1.0 + 1e-6, 1.0 + 1e-5, 1.0 + 1e-4)
 
 
@@ -377,7 +379,7 @@ def _certificate(
         exact=(0.0 if low is None else low, verdict.gamma),
         floor=floor_below(problem, verdict.gamma),
         holds=verdict.holds,
-        verified=f"(17) for a P summed from the gains, and the recursion of the exact gain: {verdict.arithmetic}",
+        verified=f"{_GRAMIAN if verdict.by_gramian else _RECURSION}: {verdict.arithmetic}",
         margins=verdict.margins,
     )
 
