@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import json
 import random
 import runpy
@@ -102,6 +103,18 @@ def test_what_cannot_be_read_is_undecided(old: str, new: str, check, tmp_path: P
     path.write_text(CORRECT[0].read_text().replace(old, new))
     code, said = check(path)
     assert (code, said.split(":")[0]) == (UNDECIDED, "undecided")
+
+
+def test_rows_of_chances_sum_to_1(check, tmp_path: Path) -> None:
+    """A row that does not is no chain, and dividing by its sum would make another one of it."""
+    path = next(path for path in CORRECT if path.stem == "paper-exact")
+    document = json.loads(path.read_text())
+    for more, answer in ((1e-12, PROVED), (1e-2, UNDECIDED), (-1e-8, UNDECIDED)):
+        changed = copy.deepcopy(document)
+        changed["problem"]["markov"]["transition"][0][0] += more
+        other = tmp_path / "row.json"
+        other.write_text(json.dumps(changed))
+        assert check(other)[0] == answer
 
 
 def test_no_gamma_is_negative(check, tmp_path: Path) -> None:

@@ -28,10 +28,10 @@ def model(p, K, H):  # eta one step on: uncorrelated (variance, V [w; eta]) for 
     assert {*p, *p["plant"], *sum(map(list, nodes), [])} <= {*KEYS.split(), *"ABCDM"}, f"it says more than {KEYS}"
     names, beta, seen = zip(*((v["name"], v["arrival_probability"], v.get("loss") == "seen") for v in nodes))
     rho = {(link["receiver"], link["sender"]): link["delivery_probability"] for link in p.get("link") or ()}
-    nw, nx, n = len(B[0]), len(A), len(nodes)
+    nw, nx, n, Pi = len(B[0]), len(A), len(nodes), p["markov"]["transition"]
     n_x = 0 if p.get("unbiased") and all(s or b == 1 for s, b in zip(seen, beta)) else nx
-    order, Pi = nw + n_x + n * nx, p["markov"]["transition"]
-    assert order <= ORDER and all(0 <= q <= 1 for q in sum(Pi, [*beta, *rho.values()])), "too large, or no probability"
+    order, off = nw + n_x + n * nx, [10**9 * abs(sum(row) - 1) for row in Pi]  # rows sum to 1, but for 1e-9
+    assert order <= ORDER and all(0 <= q <= 1 for q in sum(Pi, [*beta, *rho.values(), *off])), "too large, or no chance"
     w, x = eye(order)[:nw], eye(order)[nw:][:n_x] or zeros(nx, order)  # x_hat_i = x - e_i
     x_hat, x_next = [less(x, eye(order)[k:][:nx]) for k in range(nw + n_x, order, nx)], added(times(A, x), times(B, w))
     for j, (C, D) in enumerate((v["C"], v["D"]) for v in nodes):  # node j's innovation: y less what it expects, (5)
