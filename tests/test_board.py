@@ -44,11 +44,11 @@ WORDS = {
     f"export {GAINS} --npz -o gains.npz": "",
     f"export {GAINS} --c --node 2 -o node2": "",
     "keys init --problem zhu2020-lossy -o keys": "",
-    "design two-nodes": "scipy",
-    "demo two-nodes": "scipy",
-    "run two-nodes": "scipy",
-    "design two-nodes --price": "scipy",
-    "sweep two-nodes --set plant.A.1.1=0.1:0.2:2": "scipy",
+    "design two-nodes": "cvxpy",
+    "demo two-nodes": "cvxpy",
+    "run two-nodes": "cvxpy",
+    "design two-nodes --price": "cvxpy",
+    "sweep two-nodes --set plant.A.1.1=0.1:0.2:2": "cvxpy",
     f"analyse zhu2020-lossy --gains {GAINS}": "scipy",
     f"identify {LOSSY}": "scipy",
     "reproduce": "cvxpy",
@@ -149,7 +149,7 @@ def test_a_whole_run(python: Path, tmp_path: Path) -> None:
 def test_the_library_says_it_too(python: Path, tmp_path: Path) -> None:
     program = "import peakmesh, sys\ntry: peakmesh.design('two-nodes')\nexcept peakmesh.InputError as e: print(e)"
     ran = run(python, "-c", program, folder=tmp_path)
-    assert ran.stdout == "design needs scipy: pip install 'peakmesh[design]'\n", ran.stderr
+    assert ran.stdout == "design needs cvxpy: pip install 'peakmesh[design]'\n", ran.stderr
 
 
 def test_a_defect_is_no_missing_extra() -> None:
