@@ -104,7 +104,7 @@ def _solved(problem: Problem, seen: _Seen, lmi: decomposed.Lmi) -> Undercut:
     objective[lmi.delta] = 1.0
     answer = conic.clarabel(lmi.cones.without(_unreached(seen, lmi)), objective)
     if answer.record.status not in SOLVED or answer.z is None:
-        return Undercut(None, why_not=f"a solver says {answer.record.status} of the LMI")
+        return Undercut(None, why_not=f"the LMI was not solved ({answer.record.status})")
     units = Units(np.ones(seen.problem.nx), 1.0)
     return _mixed(problem, seen, decomposed.multipliers(seen.problem, lmi, answer.z, units))
 
