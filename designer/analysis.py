@@ -30,11 +30,12 @@ from designer.diagnosis import refuse_nothing_to_estimate
 from designer.gain.exact import Gain, exact_gain
 from designer.gain.floor import floor
 from designer.gain.worst_case import with_worst_case, worst_fixed, worst_policy
+from designer.invariants import SLOW
 from designer.ladder import Ladder, interval
 from designer.lmi import beyond_paper
 from designer.model.error_model import ErrorModel, model_of_gains
 from designer.proof.prover import Prover
-from designer.search.exact_design import SLOW, certify, confirmed, lower_end
+from designer.search.exact_design import certify, confirmed, lower_end
 
 _MOST_OF_POLICY = 500, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
 _MOST_SECONDS = 10.0  # for what no gains are below by an LMI

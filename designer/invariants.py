@@ -19,7 +19,7 @@ from designer.steered import Steered
 
 _STRICT = 1e-3  # by this part of itself P stands below the largest multiple that satisfies (17)
 _STRICT_WHERE_SLOW = 1e-6
-_SLOW = 0.98  # radius from which on one P would end the recursion late
+SLOW = 0.98  # radius of L from which on errors decay slowly: one P would end the recursion late
 _STEPS_OF_ERRORS = 300
 _ROUNDS = 8
 _FLOOR = 1e-6  # of I that is in every U, so that P > 0
@@ -87,7 +87,7 @@ def invariants(S: Map, found: Decay, units: Array, peak: Array, steered: Steered
         return Invariants([], [])
     modes, n = found.total.shape[:2]
     first = scaled(S, found.total, found.rest)
-    if found.radius < _SLOW:
+    if found.radius < SLOW:
         return Invariants([first], [])
     of_x = None
     if steered is not None and steered.known:
@@ -107,7 +107,7 @@ def _lasts(S: Map, modes: int, n: int, p: int) -> bool:
     Y[:, p:, p:] = np.eye(n - p)
     for _ in range(_STEPS_OF_ERRORS):
         Y[:, p:, p:] = S(Y)[:, p:n, p:n]
-    return not np.abs(Y).max() < _SLOW**_STEPS_OF_ERRORS
+    return not np.abs(Y).max() < SLOW**_STEPS_OF_ERRORS
 
 
 def scaled(S: Map, Z: Array, rest: Array, strict: float = _STRICT) -> Array:

@@ -19,7 +19,6 @@ from typing import TypeVar
 Made = TypeVar("Made")
 _OFTEN = 5.0  # seconds between two words on what goes on
 
-
 Look = Callable[[int], None]  # of how many steps are done, where that is known
 
 
@@ -79,16 +78,21 @@ class Budget:
     @property
     def left(self) -> float:
         """For searches."""
-        return self.seconds - self._later - self.kept - self.spent
+        return 0.0 if self.over else self._left - self.kept
+
+    @property
+    def _left(self) -> float:
+        """For whatever goes on now."""
+        return self.seconds - self._later - self.spent
 
     @property
     def is_over(self) -> bool:
         """Whether what can be left out is."""
-        return self.asked > 0 or self.left + self.kept <= 0.0
+        return self.asked > 0 or self._left <= 0.0
 
     def end(self) -> None:
-        """No more time for a search."""
-        self.seconds = min(self.seconds, self.spent)
+        """No more time for a search; all that is left is for what comes after it."""
+        self.over = True
 
     def keep(self, seconds: float) -> None:
         """So much for what comes after the search, but no more than half of all."""
@@ -123,11 +127,11 @@ class Budget:
 
         So many seconds it gets in any case.
         """
-        return self._after(lambda: self.left + self.kept / 2.0, seconds)
+        return self._after(lambda: self._left - self.kept / 2.0, seconds)
 
     def proving(self, seconds: float) -> Look:
         """In a proof: the same, but all of the time is for it."""
-        return self._after(lambda: self.left + self.kept, seconds)
+        return self._after(lambda: self._left, seconds)
 
     def _after(self, left: Callable[[], float], seconds: float) -> Look:
         until = self.spent + seconds

@@ -29,9 +29,7 @@ from designer.search.exact_design import confirmed, design_exact, gain_of, lower
 from designer.search.lmi_apart import design_apart
 
 EXACT = "exact"  # gains designed for the exact gain; no LMI, and a certificate of its own kind
-_PROVED_STATES = (
-    250  # n nx up to which gains that ignore all are an answer too, where a second signal cut the proof short
-)
+_IGNORING_STATES = 250  # n nx up to which gains that ignore all are compared, where a search or a proof was cut short
 SHARE_OF_BOX = 0.5  # of a search's time
 _SHARE_OF_WEIGHTS = 0.002  # of the budget, for what no gains are below by an LMI
 _LADDER_STATES = 500  # n nx up to which the exact gain of the LMI's gains is worth its time
@@ -93,7 +91,7 @@ def design(
             raise
         gains = least
     cut = method == EXACT and not gains.solver.status.startswith("converged")
-    if (cut or budget.asked > 1) and problem.n * problem.nx <= _PROVED_STATES:
+    if (cut or budget.asked > 1) and problem.n * problem.nx <= _IGNORING_STATES:
         ended = gains.solver.status.partition(";")[0]
         why = f"{ended}, and nothing found by then has a lower gamma that is proved"
         ignorant = gains_that_ignore(problem, method, why, started)
@@ -209,7 +207,7 @@ def _searched(
             noise = None if at.noise is None else unit**2 * at.noise
             progress(at._replace(gamma=unit * at.gamma, noise=noise))
 
-    how: dict[str, Any] = {"unit": unit, "slack": slack, "held": natural.held, "natural": natural}
+    how: dict[str, Any] = {"slack": slack, "held": natural.held, "natural": natural}
     gains = design_exact(natural.problem, budget=budget, progress=tell, dask=dask, **how)
     K, H = natural.back(gains.K, gains.H)
     lmi_gamma, lmi_exact = gains.certificate.lmi_gamma, gains.certificate.lmi_exact

@@ -59,8 +59,8 @@ ROOMS = {
     "designer.proof": "designer.coordinates designer.decay designer.invariants designer.patience designer.steered",
     "designer.lmi": "designer.gain designer.model designer.patience designer.proof",
     "designer.workers": "designer.patience",
-    "designer.search": "designer.coordinates designer.decay designer.gain designer.lmi designer.model "
-    "designer.patience designer.proof designer.workers",
+    "designer.search": "designer.coordinates designer.decay designer.gain designer.invariants designer.lmi "
+    "designer.model designer.patience designer.proof designer.workers",
     "designer.problems": "",
     "designer.diagnosis": "designer.model designer.proof",
     "designer.ladder": "designer.lmi",
@@ -75,8 +75,8 @@ ROOMS = {
     "designer.synthesis": "designer.box designer.coordinates designer.diagnosis designer.gain designer.lmi "
     "designer.model designer.patience designer.proof designer.search designer.undercut",
     "designer.stacked": "designer.model",
-    "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.ladder "
-    "designer.lmi designer.model designer.proof designer.search designer.stacked designer.undercut",
+    "designer.analysis": "designer.beyond_gamma designer.box designer.diagnosis designer.gain designer.invariants "
+    "designer.ladder designer.lmi designer.model designer.proof designer.search designer.stacked designer.undercut",
     "designer.ranking": "designer.analysis designer.box designer.gain designer.ladder designer.model designer.search "
     "designer.synthesis",
     "designer.conformity": "designer.model designer.problems designer.search",

@@ -121,7 +121,7 @@ def design_for_box(
     if descent.best is None:
         return ForBox(nominal, before, nominal, before, f"nothing better was found; {searched}")
     K, H, after = descent.best
-    budget.over = True
+    budget.end()
     try:
         certificate = budget.to_its_end(
             lambda: certify(problem, K, H, budget=budget), lambda: certify_at_once(problem, K, H)

@@ -14,6 +14,7 @@ from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer.coordinates import Coordinates
+from designer.invariants import SLOW
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_gramian import ByGramian
@@ -43,7 +44,6 @@ _LARGEST_INEQUALITY = 450
 _STEPS_OF_DISPROOF = 1000  # where there is no P to end the recursion
 MOST_STEPS_BELOW = 20_000
 _STEPS_BEFORE_LEAPS = 1000
-_SLOW = 0.98  # radius
 _SHARES = (1 / 4, 1 / 32)  # of all steps so far that w = Gamma eta is held for
 _FORGOTTEN = 40.0  # e^-40 is left of what there was, after so many times the steps that errors last
 _BITS_OF_LEAPS = 512  # a vector that turns under 64 powers of a matrix loses some hundred
@@ -105,7 +105,7 @@ class Prover:
     def _steering(self) -> Steering | None:
         """Where x decays slowly and is in eta."""
         steered = self._floats.model.steered
-        if steered is None or self.P is None or not self._problem.plant.spectral_radius**2 > _SLOW:
+        if steered is None or self.P is None or not self._problem.plant.spectral_radius**2 > SLOW:
             return None
         return Steering.of(self._problem, self.T, steered, self.P)
 
@@ -195,7 +195,7 @@ class Prover:
         known = (self._arithmetic(k) for k in range(len(self._makes)))
         by = next((by for by in known if isinstance(by, ByBalls) and by.bits >= _BITS_OF_LEAPS), None)
         radius = self._floats.model.decay.radius
-        if by is None or by.unknowns > _LARGEST_LEAP or not _SLOW < radius < 1.0:
+        if by is None or by.unknowns > _LARGEST_LEAP or not SLOW < radius < 1.0:
             return None
         most, modes = int(_FORGOTTEN / (1.0 - radius)), self._problem.mode_names
         ways: list[tuple[float, Array | None]] = [(1.0, P) for P in self._floats.model.invariants[2:]]

@@ -20,11 +20,8 @@ from designer.search.windows import windows
 
 MOST_NODES = 200  # that are searched at once; larger networks are searched in windows first
 BUDGET = 600.0  # seconds
-BUDGET_WHERE_SLOW, SLOW, FEW_STATES = (
-    90.0,
-    0.999,
-    40,
-)  # seconds, from this radius, for so many n nx: the rest gains little
+BUDGET_WHERE_SLOW = 90.0  # seconds, after which little is gained where
+_SLOW, _FEW_STATES = 0.999, 40  # the radius of the plant is this or more, and n nx no more than that
 LONG, LARGE = 60.0, 5e8  # seconds and bytes, which are worth a word beforehand
 _GRADIENTS = 680  # of 6 nodes or fewer, over 20 steps or as many as that
 _STEPS, _LEFT = 20, 2.0
@@ -50,8 +47,8 @@ def default_method(problem: Problem, *, designs: float = 1.0) -> str:
 
 def default_budget(problem: Problem) -> float:
     """Seconds that a search may take."""
-    slow = problem.carries_plant and problem.plant.spectral_radius >= SLOW
-    return BUDGET_WHERE_SLOW if slow and problem.n * problem.nx <= FEW_STATES else BUDGET
+    slow = problem.carries_plant and problem.plant.spectral_radius >= _SLOW
+    return BUDGET_WHERE_SLOW if slow and problem.n * problem.nx <= _FEW_STATES else BUDGET
 
 
 def in_windows(problem: Problem) -> bool:

@@ -29,6 +29,7 @@ from designer.gain.exact import (
     recursion_holds,
 )
 from designer.gain.floor import floor, floor_below
+from designer.invariants import SLOW
 from designer.lmi import LmiSolution, beyond_paper
 from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
@@ -51,13 +52,9 @@ _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
 _LEAPT = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # below either end, which takes little time; the last is tried first
 _FAR_BELOW = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if not far below
-SLOW = 0.98  # radius
 _SOON, _FEW_STATES = 5000, 60  # steps, which a gamma a little larger may save; n nx up to which that is tried
 _A_LITTLE_LARGER = (1.0, 1.0 + 1e-6, 1.0 + 1e-5)
-_SOON_IN_BALLS, _FEWER_STATES = (
-    500,
-    20,
-)  # steps and n nx that balls take in a second: asked before gamma is larger by more
+_SOON_IN_BALLS, _FEWER_STATES = 500, 20  # that balls take in a second: asked before gamma is larger by more
 _STARTS_OF_THE_END = 12  # of a large network: as long as its gains of least variance, so many times
 _FEWEST = 400  # evaluations of the whole after windows: with less, it may lead to nothing that is stable
 _PROVED_STATES = 250  # n nx up to which the lower end is proved at once
@@ -83,7 +80,6 @@ def design_exact(
     budget: Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
-    unit: float = 1.0,
     slack: float = 0.0,
     held: NDArray[np.bool_] | None = None,
     natural: NaturalUnits | None = None,
@@ -94,10 +90,11 @@ def design_exact(
 
     `first` and `last`: as `descend` takes them. KeyboardInterrupt ends the search, and so does the end of the budget,
     which begins when it is made; the best so far is returned. Windows are spread over a cluster at `dask`, if there is
-    one. `unit`: of z; it counts in the status alone. `held` (nx, nx): entries of K_ij that are to be 0, unless windows
-    are searched. `natural`: the units that `problem` is in; the certificate is for the one that was given.
+    one. `held` (nx, nx): entries of K_ij that are to be 0, unless windows are searched. `natural`: the units that
+    `problem` is in; the certificate is for the one that was given, and the status too.
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
+    unit = 1.0 if natural is None else natural.output
     refuse_without_memory(problem)
     if dask is not None:
         greet_cluster(dask)  # before the starts, which may take minutes
@@ -138,7 +135,7 @@ def design_exact(
             gain = found.gains.gain
     solved = time.perf_counter()
     K, H = link_gains(problem, *stacked)
-    budget.over = True
+    budget.end()
     budget.goes_on(phase := "proving gamma", partial(_steps_of_proof, problem, stacked, gain))
     if progress is not None:
         spent = time.perf_counter() - started

@@ -80,6 +80,17 @@ def test_a_proof_gets_all_that_was_kept_and_a_little_in_any_case() -> None:
     assert ended_by(begun[9.5]) is TimeIsUp
 
 
+def test_a_search_that_is_over_leaves_its_time_to_what_comes_after_it() -> None:
+    budget, clock = budget_of(10.0)
+    budget.keep(4.0)
+    clock.now = 2.0
+    budget.end()
+    assert ended_by(budget.check) is TimeIsUp
+    for clock.now, proof, comparison in ((9.9, None, None), (10.1, TimeIsUp, TimeIsUp)):
+        assert ended_by(budget.proving(0.0)) is proof
+        assert ended_by(budget.check_comparison) is comparison
+
+
 def test_searches_share_what_is_left() -> None:
     """The second has all of it."""
     budget, clock = budget_of(10.0)
