@@ -42,7 +42,7 @@ def design(
     within: Within | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Gains:
-    """Gains with a proved gamma (`peakmesh design`); `budget` in seconds, for the method "exact".
+    """Gains with a proved gamma (`peakmesh design`); `budget` in seconds for all of it, by default as the command's.
 
     `peak_slack`: gamma may be that part larger than the least one that is found, 0.05 say, for the least noise.
     `within`: for every model of a box, {"probabilities": 0.02, "A,B,C,D": "1%"} say; without it for that of the
@@ -53,10 +53,11 @@ def design(
     from designer import synthesis
     from designer.box.claim import with_claim
     from designer.box.extent import asked
+    from designer.search.effort import default_budget
 
     wanted, texts = find(problem), _texts(within)
-    how: dict[str, Any] = {} if budget is None else {"budget": budget}
-    how |= {"method": method, "peak_slack": peak_slack, "progress": progress}
+    how: dict[str, Any] = {"method": method, "peak_slack": peak_slack, "progress": progress}
+    how["budget"] = default_budget(wanted) if budget is None else budget
     box = asked(wanted, texts)
     if box is None:
         return synthesis.design(wanted, **how)
