@@ -25,7 +25,6 @@ Numbers = NDArray[np.int64]
 
 NAMED = 20  # so many faults of a kind are named, the others counted
 _ROWS = 1 << 20  # of the columns at first, where the run has so many steps
-_STAMP = ("number", "time")  # columns that are not of a message's content
 _AT_ONCE = 512  # messages of a topic that wait to be entered together
 
 
