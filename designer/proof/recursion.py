@@ -137,6 +137,7 @@ def disproof_by_costs(arithmetic: Arithmetic, modes: Modes, gamma: float, costs:
     """Whether it is proved that the recursion fails in the end, for all that w has to spend before."""
     Y, next_look = arithmetic.start(up=False), 0
     for step in range(most + 1):
+        look()
         if step >= next_look:
             about = arithmetic.floats(Y)
             u = costs.direction(about, gamma)
@@ -206,20 +207,21 @@ class Weighing(Protocol):
         """S(Y), (modes, n_eta + nw, n_eta + nw); X says nothing here."""
 
 
-@np.errstate(all="ignore")
 def seen_by_floats(by: Weighing, gamma: float, most: int) -> Iterator[Array]:
     """Y of the recursion every now and then, as far as it goes in so many steps; a look ahead that proves nothing."""
     Y, next_look, g = by.start(up=True), 0, gamma**2
     n = Y.shape[1]
     for steps in range(most + 1):
+        look()
         if steps >= next_look:
             yield Y
             next_look = steps + 1 + steps // 16
-        S = by.weigh(Y, Y)
-        W = g * np.eye(S.shape[1] - n) - S[:, n:, n:]
         try:
-            np.linalg.cholesky(W)
-            Y = S[:, :n, :n] + S[:, :n, n:] @ np.linalg.solve(W, S[:, n:, :n])
+            with np.errstate(all="ignore"):  # here, as around a generator it would be over before the first step
+                S = by.weigh(Y, Y)
+                W = g * np.eye(S.shape[1] - n) - S[:, n:, n:]
+                np.linalg.cholesky(W)
+                Y = S[:, :n, :n] + S[:, :n, n:] @ np.linalg.solve(W, S[:, n:, :n])
         except np.linalg.LinAlgError:
             return
 

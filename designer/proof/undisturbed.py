@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from agent.contract.arrays import Array
+from designer.patience import look
 from designer.proof.float64 import TINY, UP, product, relative
 from designer.proof.recursion import Arithmetic
 
@@ -61,6 +62,7 @@ def largest(by: Undisturbed, P: Array, starts: Starts) -> float | None:
         return None
     of_P, Y, most, next_look = starts.above(P), by.start(up=True), 0.0, 0
     for step in range(steps + 1):
+        look()
         Y_floats = by.floats(Y)
         most = max(most, starts.above(Y_floats))
         if step == steps or step >= next_look:

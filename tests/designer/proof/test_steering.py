@@ -15,9 +15,11 @@ from agent.contract.problem import Problem
 from designer.gain.exact import Gain, InvariantSet, Operator, exact_gain, recursion_holds, step
 from designer.invariants import Invariants, invariants
 from designer.model.error_model import ErrorModel, StackedGains, error_model, link_gains
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.by_balls import ByBalls
+from designer.proof.by_floats import ByFloats
 from designer.proof.prover import FLOATS, Prover
-from designer.proof.recursion import Costs
+from designer.proof.recursion import Costs, disproof_by_costs, seen_by_floats
 from designer.proof.steering import Steering
 from designer.search.exact_design import confirmed, lower_end
 from designer.steered import Steered, summed
@@ -228,3 +230,25 @@ def test_no_steps_are_enough_where_the_errors_may_undo_it() -> None:
     problem, model = slow(0.9999)
     costs: Costs = costs_of(prover_of(problem))
     assert costs.direction(np.asarray(Operator(model).MM), 0.1 * gain_of(model).low) is None
+
+
+def test_whoever_follows_a_recursion_looks_whether_to_end() -> None:
+    problem, _ = slow(0.999)
+    by, costs = ByFloats(problem, *link_gains(problem, *gains_for(problem))), prover_of(problem)._steering
+    assert costs is not None
+    with looking(Budget(0.0).check):
+        with pytest.raises(TimeIsUp):
+            disproof_by_costs(by, problem.mode_names, 1.0, costs, most=1)
+        with pytest.raises(TimeIsUp):
+            next(seen_by_floats(by, 1.0, 1))
+
+
+def test_what_overflows_in_a_look_ahead_is_no_warning() -> None:
+    class Overflowing:
+        def start(self, *, up: bool) -> Array:
+            return np.full((1, 1, 1), 1e200)
+
+        def weigh(self, Y: Array, X: Array) -> Array:
+            return np.array([[[1e200, 0.0], [0.0, 0.0]]]) * Y
+
+    assert np.isinf(list(seen_by_floats(Overflowing(), 1.0, 1))[-1]).all()

@@ -15,12 +15,13 @@ from outcomes import moment
 from agent.contract.arrays import Array
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
+from designer.patience import Budget, TimeIsUp, looking
 from designer.proof import by_floats, undisturbed
 from designer.proof.balls import diagonal, exact, part, sign
 from designer.proof.by_balls import ByBalls
 from designer.proof.by_floats import ByFloats
 from designer.proof.prover import BALLS, FLOATS, Make, Prover
-from designer.proof.undisturbed import Starts
+from designer.proof.undisturbed import Starts, largest
 from designer.start import left_by_start
 
 ERROR = [0.1, 0.3]
@@ -164,3 +165,11 @@ def test_where_the_steps_end_first_the_bound_is_still_one(monkeypatch: pytest.Mo
     assert found is not None
     assert math.isfinite(found)
     assert latest_peak(0.9) < Fraction(found)
+
+
+def test_it_looks_whether_to_end() -> None:
+    problem, K, H = jordan()
+    by, P = ByFloats(problem, K, H), Prover(problem, K, H).P
+    assert P is not None
+    with pytest.raises(TimeIsUp), looking(Budget(0.0).check):
+        largest(by, P, Starts(0, np.array([ERROR]), None))
