@@ -88,7 +88,7 @@ def balance(L: Map, modes: int, n: int) -> Array:
 
     In a line of states each of which hands on more than it got, Z grows without end along the line, and so does what
     rounding does to it. N says how the weight of each state alone goes over to others. In these units no entry of it
-    off the diagonal is above the geometric mean of those on the worst circle of several states, or where that is less,
+    off the diagonal is above the geometric mean of those on the worst cycle of several states, or where that is less,
     above a part of what decays or grows in a state by itself.
     """
     N = np.empty((n, n))  # N[j, i]: what of a weight 1 of state i state j has a step earlier
@@ -102,7 +102,7 @@ def balance(L: Map, modes: int, n: int) -> Array:
     np.fill_diagonal(N, 0.0)
     with np.errstate(divide="ignore"):
         onwards = np.log(np.maximum(N, 0.0))
-    most = max(_worst_circle(onwards), np.log(_HANDED_ON * max(own, _NEAR) ** 2))
+    most = max(_largest_cycle_mean(onwards), np.log(_HANDED_ON * max(own, _NEAR) ** 2))
     while True:
         logs = np.zeros(n)
         for _ in range(n):
@@ -112,8 +112,8 @@ def balance(L: Map, modes: int, n: int) -> Array:
         most += 1.0
 
 
-def _worst_circle(onwards: Array) -> float:
-    """The largest mean of `onwards` on a circle, by Karp's theorem; -inf where there is none."""
+def _largest_cycle_mean(onwards: Array) -> float:
+    """The largest mean of `onwards` on a cycle, by Karp's theorem; -inf where there is none."""
     n = len(onwards)
     longest = np.full((n + 1, n), -np.inf)  # of all walks of so many steps that end there
     longest[0] = 0.0

@@ -1,9 +1,9 @@
 """Until when work may go on, and who asks it to end: whoever takes long looks at every step of it.
 
-A signal and the end of a budget are seen where somebody looks, and nowhere else: KeyboardInterrupt and TimeIsUp come
-from there, never out of the middle of a library. What is raised for depends on what goes on, and a `Budget` knows
-three kinds of work: a search, which ends at once; what there has to be, which a second signal alone cuts short; and
-comparisons, which are left out where they cannot be had.
+Cancellation is cooperative. A signal and the end of a budget are seen where somebody looks, and nowhere else:
+KeyboardInterrupt and TimeIsUp come from there, never out of the middle of a library. What is raised for depends on what
+goes on, and a `Budget` knows three kinds of work: a search, which ends at once; what there has to be, which a second
+signal alone cuts short; and comparisons, which are left out where they cannot be had.
 """
 
 from __future__ import annotations

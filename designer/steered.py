@@ -1,9 +1,9 @@
 """What w steers alone: x, which no error, no loss and no mode moves; docs/theory.md, section 3.
 
-To bring x to xi = G u takes u'G u = xi'G^-1 xi of sum |w|^2, and no less, G the sum of all A^j B B' A'^j. So with
-P_x = diag{G^-1, 0} all of (17) is true, with nothing to spare; and where the recursion at g weighs x by more than
-g P_x, whatever the errors then are, w had better bring it there, so that no bound is below sqrt g. Where only x decays
-slowly either is seen after the few steps in which errors die out. All is found in floats.
+To bring x to xi = G u takes u'G u = xi'G^-1 xi of sum |w|^2, and no less, G the sum of all A^j B B' A'^j, the
+reachability Gramian. So with P_x = diag{G^-1, 0} all of (17) is true, with nothing to spare; and where the recursion at
+g weighs x by more than g P_x, whatever the errors then are, w had better bring it there, so that no bound is below sqrt
+g. Where only x decays slowly either is seen after the few steps in which errors die out. All is found in floats.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What no gains can undercut by Theorem 2, with the weights that prove it (designer.proof.least).
+"""What no gains can undercut by Theorem 2, a lower bound by duality, with the weights that prove it.
 
-The multipliers of the LMI's balance are the best weights, up to a solver's tolerance. So they are mixed with a little
-of weights that have much to spare: the moments of a network under white noise, each of whose nodes takes the gains of
-least variance, and of which a part is forgotten in every step. The LMI is solved for states in which these moments are
-near the identity: there, what a solver misses is as small beside them in every direction. Where a design has solved the
-LMI in states of its own, its multipliers are tried first.
+designer.proof.least proves it from them. The multipliers of the LMI's balance are the best weights, up to a solver's
+tolerance. So they are mixed with a little of weights that have much to spare: the moments of a network under white
+noise, each of whose nodes takes the gains of least variance, and of which a part is forgotten in every step. The LMI is
+solved for states in which these moments are near the identity: there, what a solver misses is as small beside them in
+every direction. Where a design has solved the LMI in states of its own, its multipliers are tried first.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
 """Errors in which chance has no say, as where all nodes ignore all measurements: their gain by the gramian, in floats.
 
+They are a linear system without multiplicative noise, whose l2 to l-infinity gain is known by its reachability Gramian:
 gamma^2 is the largest eigenvalue of M G M', G the sum of all A^j B B' A'^j: designer.proof.by_gramian proves it.
 """
 
