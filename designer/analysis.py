@@ -35,7 +35,7 @@ from designer.ladder import Ladder, interval
 from designer.lmi import beyond_paper
 from designer.model.error_model import ErrorModel, model_of_gains
 from designer.proof.prover import Prover
-from designer.search.exact_design import certify, confirmed, lower_end
+from designer.search.exact_design import certify, confirmed, lower_end, narrowed
 
 _MOST_OF_POLICY = 500, 4e6  # steps of the worst policy where errors decay slowly, and numbers of all Y in them
 _MOST_SECONDS = 10.0  # for what no gains are below by an LMI
@@ -255,7 +255,7 @@ def analyse(
 
     refuse_nothing_to_estimate(problem)
     model = model_of_gains(problem, given.K, given.H)
-    gain = exact_gain(model)
+    gain = narrowed(problem, given.K, given.H, exact_gain(model))
     exact = (gain.low, gain.high) if gain.stable else None
     least = floor(problem)
     ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)

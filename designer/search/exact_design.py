@@ -35,6 +35,7 @@ from designer.lmi.recovery import recover
 from designer.model.error_model import StackedGains, error_model, link_gains, model_of_gains
 from designer.model.units import NaturalUnits
 from designer.patience import Budget, TimeIsUp, looking
+from designer.proof.by_gramian import ByGramian
 from designer.proof.findings import Verdict
 from designer.proof.prover import BALLS, FLOATS, MOST_STEPS_BELOW, Prover
 from designer.proof.recursion import MOST_STEPS
@@ -49,6 +50,7 @@ from designer.workers import greet_cluster
 _LMI_STARTS = ("theorem2", "decomposed")
 _LMI_STATES = 8  # n nx up to which an LMI, a second or two there, gives one more start
 _LMI_ROUNDING = 1e-3  # a solver may state its bound so much too low
+_WIDE = 1e-6  # of a gain where chance has no say: what floats know less of, balls know
 _BELOW = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)
 _LEAPT = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # below either end, which takes little time; the last is tried first
 _FAR_BELOW = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 0.5)  # and by steps: a W fails after many, if not far below
@@ -347,7 +349,7 @@ def _near(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain | None,
         verdict = confirmed(problem, K, H, gain.high) if gain.stable else None
         if verdict is not None and verdict.holds:
             return _certificate(problem, K, H, gain, verdict, budget)
-    gain = exact_gain(model_of_gains(problem, K, H))
+    gain = narrowed(problem, K, H, exact_gain(model_of_gains(problem, K, H)))
     if not gain.stable:
         known = Prover(problem, K, H).stable.holds
         are = "are not mean-square stable, which is proved" if known is False else "are not known to be stable"
@@ -424,6 +426,22 @@ def gain_of(problem: Problem, K: LinkMatrices, H: LinkMatrices) -> Gain:
 def in_units_of(unit: float, gain: Gain) -> Gain:
     """What is known of z in units of `unit`, of z itself."""
     return gain._replace(low=unit * gain.low, high=unit * gain.high)
+
+
+def narrowed(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) -> Gain:
+    """Where chance has no say and floats allow for much rounding, since errors hardly decay: what balls tell."""
+    low, high = gain.bounds or (0.0, 0.0)
+    wide = gain.P is None and high - low > _WIDE * high
+    by = ByGramian.of(problem, K, H) if wide else None
+    while by is not None and high - low > _WIDE * high:
+        sign = by.sign(middle := (low + high) / 2.0)
+        if sign.proved:
+            high = middle
+        elif sign.refuted:
+            low = middle
+        else:
+            break
+    return gain if by is None else gain._replace(low=low, high=high)
 
 
 def lower_end(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain) -> float:

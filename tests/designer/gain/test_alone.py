@@ -14,6 +14,7 @@ from networks import random_gains, random_problem, real_network
 from agent.contract.arrays import Array
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
+from designer.analysis import analyse, given_plain
 from designer.gain.alone import Alone
 from designer.gain.exact import Operator, exact_gain, horizon_gain, node_gains
 from designer.model.error_model import error_model, link_gains, stacked_links
@@ -89,6 +90,17 @@ def test_it_is_the_gain_of_exact_sums() -> None:
     assert proof.sign(true * (1.0 + 1e-12)).proved
     assert proof.sign(true * (1.0 - 1e-12)).refuted
     assert exact_gain(error_model(problem, *ignoring(problem))).low == pytest.approx(true, rel=1e-8)
+
+
+@pytest.mark.parametrize("left", [1e-3, 1e-12, 1e-15])
+def test_a_filter_that_hardly_decays_is_told_as_closely_as_another(left: float) -> None:
+    """K = 1 - left on an estimate that nothing excites: what floats allow for, balls narrow. The error is x itself."""
+    problem = with_plant(np.array([[0.5]]), np.array([[1.0]]), np.array([[1.0]]), nodes=1, modes=1)
+    mode, node = problem.mode_names[0], problem.node_names[0]
+    K, H = ({mode: {node: {node: np.array([[entry]])}}} for entry in (1.0 - left, 0.0))
+    true = math.sqrt(4.0 / 3.0 * float((problem.weights**2).sum()))
+    for low, high in (certify(problem, K, H).exact, analyse(problem, given_plain(problem, K, H)).ladder.exact):
+        assert low <= true <= high < low * (1.0 + 3e-6)
 
 
 @pytest.mark.parametrize("unbiased", [False, True])
