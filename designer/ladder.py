@@ -104,7 +104,8 @@ class Ladder(NamedTuple):
         width = max((len(value) for value, _ in texts), default=0)
         lines = [f"{value:{width}}  {name}" for value, name in texts]
         if not self.knows_exact and self.gamma is not None:
-            lines.append(f"{'-':{width}}  {EXACT}: not computed; analyse does")
+            why = "not computed; analyse does" if self.exact is None else "not known, as no lower end of it was proved"
+            lines.append(f"{'-':{width}}  {EXACT}: {why}")
         if self.theorem2_why_not is not None:
             lines.append(f"{'-':{width}}  what no gains are below by {self.lmi}: not proved; {self.theorem2_why_not}")
         return lines
