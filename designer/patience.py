@@ -66,11 +66,6 @@ class Budget:
         self.tell: Callable[[str], None] = lambda words: None
         self._goes_on, self._told, self._steps = "", math.inf, _unknown
 
-    @classmethod
-    def of(cls, seconds: float | Budget) -> Budget:
-        """One that may have begun."""
-        return seconds if isinstance(seconds, Budget) else cls(seconds)
-
     @property
     def spent(self) -> float:
         return self._clock() - self._begun

@@ -15,7 +15,7 @@ from agent.contract.errors import InputError, Unattainable
 from agent.contract.problem import Problem
 from designer.ladder import ladder_of
 from designer.problems import find
-from designer.search.effort import BUDGET, default_method
+from designer.search.effort import default_method
 from designer.synthesis import design
 from designer.workers import each, greet_cluster
 
@@ -47,7 +47,7 @@ class _Job(NamedTuple):
     value: float
     problem: Problem
     method: str
-    budget: float
+    budget: float | None
 
 
 def parse_range(text: str) -> Range | None:
@@ -86,7 +86,7 @@ def sweep(
     problems: Sequence[Problem],
     *,
     method: str | None = None,
-    budget: float = BUDGET,
+    budget: float | None = None,
     dask: str | None = None,
     processes: int | None = None,
     report: Callable[[int, int, str], None] = lambda done, of, what: None,

@@ -24,7 +24,7 @@ from designer.patience import Budget, TimeIsUp, looking
 from designer.proof.certificate import lyapunov_matrix
 from designer.search.baselines import BASELINES, design_baseline
 from designer.search.descent import Progress
-from designer.search.effort import BUDGET, default_method
+from designer.search.effort import default_budget, default_method
 from designer.search.exact_design import confirmed, design_exact, gain_of, lower_end
 from designer.search.lmi_apart import design_apart
 
@@ -44,7 +44,7 @@ def design(
     problem: Problem,
     *,
     method: str | None = None,
-    budget: float | Budget = BUDGET,
+    budget: float | Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
     peak_slack: float = 0.0,
@@ -52,15 +52,16 @@ def design(
     """Gains for every mode and link, with a gamma that the check without a solver confirms.
 
     The default method is "exact"; for more than 200 nodes of whom some hear very many others it is "decomposed".
-    `budget`: seconds for all of it. When they are over, or a signal came that the budget was told of, the best gains
-    so far are proved and returned, for a stable plant those that ignore all measurements at least; else there is
-    KeyboardInterrupt. What was left out is said in the budget. `progress` is for the method "exact".
+    `budget`: seconds for all of it, by default as many as the problem is worth. When they are over, or a signal came
+    that the budget was told of, the best gains so far are proved and returned, for a stable plant those that ignore all
+    measurements at least; else there is KeyboardInterrupt. What was left out is said in the budget. `progress` is for
+    the method "exact".
     `dask`: the address of a cluster for the windows of large networks.
     `peak_slack`, for that method too: gamma may be that part larger than the least one, for gains with less noise.
     Raises InputError for an unknown method, Unattainable where no gains or no certificate were found, with the reason
     as far as it is known.
     """
-    budget, started = Budget.of(budget), time.perf_counter()
+    budget, started = _budget(problem, budget), time.perf_counter()
     method = default_method(problem) if method is None else method
     if method not in methods():
         raise InputError(f'method "{method}" does not exist; the methods are {listed(methods())}')
@@ -104,6 +105,13 @@ def design(
     return with_worst_case(gains.model_copy(update={"certificate": certificate}))
 
 
+def _budget(problem: Problem, budget: float | Budget | None) -> Budget:
+    """One that may have begun."""
+    if isinstance(budget, Budget):
+        return budget
+    return Budget(default_budget(problem) if budget is None else budget)
+
+
 def _from_elsewhere(stopped: BaseException, budget: Budget) -> bool:
     """Whether this came from somebody who does not tell the budget, and wants all to end."""
     return isinstance(stopped, KeyboardInterrupt) and not budget.asked
@@ -118,7 +126,7 @@ def design_in_box(
     box: Box,
     *,
     method: str | None = None,
-    budget: float | Budget = BUDGET,
+    budget: float | Budget | None = None,
     progress: Callable[[Progress], None] | None = None,
     dask: str | None = None,
     peak_slack: float = 0.0,
@@ -128,7 +136,7 @@ def design_in_box(
     As `design`, which begins and takes up to half of the budget. Other methods do not design for a box, nor does
     `peak_slack`: of their gains it is proved what holds.
     """
-    budget = Budget.of(budget)
+    budget = _budget(problem, budget)
     with budget.leaving(SHARE_OF_BOX):
         nominal = design(problem, method=method, budget=budget, progress=progress, dask=dask, peak_slack=peak_slack)
     found = from_nominal(problem, box, nominal, budget, progress=progress)

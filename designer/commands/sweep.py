@@ -43,7 +43,6 @@ def sweep_command(options: argparse.Namespace) -> int:
         from designer.report import figures
 
         figures.paths([NAME], options.figures, kind=options.format or FORMATS[0], force=options.force)
-    from designer.search.effort import BUDGET
     from designer.sweep import as_csv, document, problems, sweep
 
     over, revised = problems(options.problem, options.settings)
@@ -52,7 +51,7 @@ def sweep_command(options: argparse.Namespace) -> int:
         over,
         revised,
         method=options.method,
-        budget=BUDGET if options.budget is None else options.budget,
+        budget=options.budget,
         dask=options.dask,
         report=_show,
     )

@@ -153,3 +153,8 @@ def one_node(plant: dict[str, object], C: list[list[float]]) -> dict[str, object
         "topology": [{"name": "still", "adjacency": [[1.0]]}],
         "markov": {"transition": [[1.0]], "initial": "still"},
     }
+
+
+def test_without_a_budget_there_is_that_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synthesis, "default_budget", lambda problem: 1e-9)
+    assert design(find("two-nodes")).solver.status.startswith("out of time")

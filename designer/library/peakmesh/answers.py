@@ -53,11 +53,9 @@ def design(
     from designer import synthesis
     from designer.box.claim import with_claim
     from designer.box.extent import asked
-    from designer.search.effort import default_budget
 
     wanted, texts = find(problem), _texts(within)
-    how: dict[str, Any] = {"method": method, "peak_slack": peak_slack, "progress": progress}
-    how["budget"] = default_budget(wanted) if budget is None else budget
+    how: dict[str, Any] = {"method": method, "budget": budget, "peak_slack": peak_slack, "progress": progress}
     box = asked(wanted, texts)
     if box is None:
         return synthesis.design(wanted, **how)
