@@ -20,6 +20,7 @@ Made = TypeVar("Made")
 _OFTEN = 5.0  # seconds between two words on what goes on
 
 Look = Callable[[int], None]  # of how many steps are done, where that is known
+Over = Callable[[], bool]  # asked before each step that may be left out
 
 
 def _on(steps: int) -> None:
@@ -31,6 +32,11 @@ def _unknown() -> int | None:
 
 
 _looks: ContextVar[Look] = ContextVar("looks", default=_on)
+
+
+def never() -> bool:
+    """There is no budget."""
+    return False
 
 
 class TimeIsUp(Exception):
@@ -137,6 +143,21 @@ class Budget:
                 raise TimeIsUp
 
         return check
+
+    def over_after(self, share: float, what: str) -> Over:
+        """For a search with an answer before its end, which is proved: whether so much of the time left now is gone.
+
+        Where it is, `what` is left out. A signal does not end such a search.
+        """
+        until = self.spent + share * max(self.left + self.kept, 0.0)
+
+        def over() -> bool:
+            gone = self.spent >= until
+            if gone and what not in self.left_out:
+                self.left_out.append(what)
+            return gone
+
+        return over
 
     def check_last(self, steps: int = 0) -> None:
         """In what there has to be: KeyboardInterrupt after the second signal; every now and then a word on it."""

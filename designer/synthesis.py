@@ -156,7 +156,6 @@ def from_nominal(
     """The same from gains that were designed without the box; None where a second signal came before it was proved."""
     search = not (budget.asked or nominal.solver.status.startswith("interrupted"))
     budget.over = not search
-    budget.goes_on("proving gamma for every model of the box")
     return budget.to_its_end(
         lambda: design_for_box(problem, box, nominal, search=search, budget=budget, progress=progress),
         lambda: None,

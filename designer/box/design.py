@@ -105,11 +105,11 @@ def design_for_box(
     """
     started, budget = time.perf_counter(), Budget() if budget is None else budget
     try:
-        before = robust(problem, nominal.K, nominal.H, box)
+        before = robust(problem, nominal.K, nominal.H, box, budget=budget)
     except KeyboardInterrupt:  # without it nothing is known of the box
         if budget.asked > 1:
             raise
-        before, search = robust(problem, nominal.K, nominal.H, box), False
+        before, search = robust(problem, nominal.K, nominal.H, box, budget=budget), False
     budget.keep(_PROOFS_KEPT * (time.perf_counter() - started))
     if nominal.method != "exact":
         return ForBox(nominal, before, nominal, before, f"method {nominal.method} does not design for a box")
@@ -239,7 +239,7 @@ class _Search:
     def prove(self) -> float:
         """Gamma of v for the box, infinite where none is proved; kept, if it is the least."""
         K, H = self.natural.back(*link_gains(self.natural.problem, *self.barrier.entries.unpack(self.v)))
-        found = robust(self.problem, K, H, self.box)
+        found = robust(self.problem, K, H, self.box, budget=self.budget)
         self.is_proved = True
         gamma = math.inf if found.gamma is None else found.gamma
         if gamma < self.least:

@@ -15,6 +15,7 @@ from designer.box.weights import Recipe, moved
 from designer.box.worst import Worst, model_of, there_of, worst
 from designer.gain.exact import Operator
 from designer.model.error_model import ErrorModel
+from designer.patience import Budget
 from designer.proof.ball_model import Truth, told
 from designer.proof.by_vertices import ByVertices, prove
 from designer.proof.cube import Cube
@@ -22,6 +23,7 @@ from designer.proof.findings import Verdict
 from designer.proof.recursion import Arithmetic
 from designer.proof.vertices_by_balls import VerticesByBalls
 
+_SHARE_OF_WORST = 0.5  # of the time there is, before weights are sought
 _CLAIMED = (1e-6, 1e-5, 1e-4, 1e-3)  # gamma beyond what floats find, until it is proved
 
 
@@ -94,18 +96,26 @@ class Robust(NamedTuple):
         return str(self.verdict.failure)
 
 
-def robust(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, *, balls: bool = False) -> Robust:
+def robust(
+    problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, *, balls: bool = False, budget: Budget | None = None
+) -> Robust:
     """The worst model that a search finds, and the least gamma for all: sought in floats, then proved.
 
-    `balls`: and proved once more in ball arithmetic.
+    `balls`: and proved once more in ball arithmetic. Where the `budget` is over, what was found by then is proved.
     """
-    found = worst(problem, K, H, box)
+    budget = Budget() if budget is None else budget
+    budget.goes_on("looking for the worst model of the box")
+    over = budget.over_after(_SHARE_OF_WORST, "to look at more models of the box, for the worst")
+    found = worst(problem, K, H, box, over)
     if not math.isfinite(found.gain):
         return Robust(box, found, None)
     models, likely = models_of(problem, K, H, box, found.truth)
-    least = sought(models, likely, found.gain**2)
+    budget.goes_on("looking for the least gamma for every model of the box")
+    over = budget.over_after(1.0, "a gamma for the box as low as floats find it")
+    least = sought(models, likely, found.gain**2, over=over)
     if least is None:
         return Robust(box, found, None)
+    budget.goes_on("proving gamma for every model of the box")
     for more in _CLAIMED:
         verdict = prove(least.by, problem.mode_names, math.sqrt(least.g) * (1.0 + more), least.P)
         if verdict.holds:

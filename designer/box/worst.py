@@ -18,6 +18,7 @@ from designer.coordinates import There
 from designer.gain.exact import exact_gain
 from designer.model.error_model import ErrorModel, stacked_links
 from designer.model.mismatch import Real, real_error_model
+from designer.patience import Over, never
 from designer.proof.ball_model import Truth, told
 from designer.proof.cube import Cube
 
@@ -79,15 +80,19 @@ def real_transition(truth: Truth) -> Array:
 
 
 def _ascent(
-    gain_at: Callable[[list[int]], float], at: list[int], most: float, choices: list[list[int]]
+    gain_at: Callable[[list[int]], float], at: list[int], most: float, choices: list[list[int]], over: Over
 ) -> tuple[list[int], float]:
     """One change after the other, as long as one makes it worse."""
     for _ in range(_ROUNDS):
         before = list(at)
         for place, options in enumerate(choices):
             for k in options:
+                if k == at[place] or not math.isfinite(most):
+                    continue
+                if over():
+                    return at, most
                 tried = [*at[:place], k, *at[place + 1 :]]
-                gain = gain_at(tried) if k != at[place] and math.isfinite(most) else 0.0
+                gain = gain_at(tried)
                 if gain > most:
                     at, most = tried, gain
         if at == before:
@@ -95,8 +100,11 @@ def _ascent(
     return at, most
 
 
-def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst:
-    """Probabilities and rows first, with the matrices of the file; then all entries at once; then both again."""
+def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, over: Over = never) -> Worst:
+    """Probabilities and rows first, with the matrices of the file; then all entries at once; then both again.
+
+    Where it is `over`, the worst of those that were looked at.
+    """
     split, last = len(box.intervals), len(box.intervals) + len(box.rows)
     choices: list[list[int]] = [[0, 1]] * split + [list(range(len(rows))) for rows in box.rows]
     choices += [[-1, 1]] * len(box.entries)
@@ -109,16 +117,16 @@ def worst(problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box) -> Worst
         return _gain(there, truth(at))
 
     at = [0] * len(choices)
-    at, most = _ascent(gain_at, at, gain_at(at), choices[:last])
+    at, most = _ascent(gain_at, at, gain_at(at), choices[:last], over)
     for _ in range(_TURNS if any(len(options) > 1 for options in choices[:last]) else 1):
-        if not (box.entries and math.isfinite(most)):
+        if not (box.entries and math.isfinite(most)) or over():
             break
         cube = Cube(problem, K, H, truth_at(problem, box, *_corner(at, split, last)), box.entries, there.T)
         tried = at[:last] + list(worst_constant(cube, most).signs(cube))
         gain = gain_at(tried)
         if not gain > most:
             break
-        at, most = _ascent(gain_at, tried, gain, choices[:last])
+        at, most = _ascent(gain_at, tried, gain, choices[:last], over)
     nominal = told(problem)._replace(carry=box.carry)  # which the box holds too
     most = max(_gain(there, model, width=_CLOSE) for model in (truth(at), nominal)) if math.isfinite(most) else most
     return Worst(truth(at), most, *_corner(at, split, last), tuple(at[last:]))

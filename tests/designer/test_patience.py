@@ -105,6 +105,26 @@ def test_searches_share_what_is_left() -> None:
         assert ended_by(Budget().check) is None
 
 
+def test_a_search_with_an_answer_before_its_end_gets_a_share_of_what_is_left() -> None:
+    """Of all that is left, and nothing where nothing is; signals do not end it; what it asks for is left out."""
+    budget, clock = budget_of(10.0)
+    budget.keep(4.0)
+    clock.now = 2.0
+    half, all_of_it = budget.over_after(0.5, "half"), budget.over_after(1.0, "all")
+    budget.asked = 1
+    clock.now = 5.9
+    assert not half()
+    clock.now = 6.1
+    assert half()
+    assert half()
+    assert not all_of_it()
+    assert budget.left_out == ["half"]
+    clock.now = 10.1
+    assert all_of_it()
+    assert budget.over_after(1.0, "late")()
+    assert budget.left_out == ["half", "all", "late"]
+
+
 def test_what_there_has_to_be_is_there() -> None:
     """KeyboardInterrupt that comes from elsewhere counts for none the first time."""
     budget, _ = budget_of(0.0)

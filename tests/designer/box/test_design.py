@@ -177,7 +177,7 @@ def test_gains_of_which_no_less_is_proved_are_not_taken(worse: float, monkeypatc
     before = robust(nominal().problem, nominal().K, nominal().H, box())
     assert before.verdict is not None
 
-    def proved(problem: Problem, K: Any, H: Any, box: Box) -> Any:
+    def proved(problem: Problem, K: Any, H: Any, box: Box, *, budget: Budget) -> Any:
         of_nominal = K is nominal().K
         verdict = (
             before.verdict
@@ -206,9 +206,9 @@ def test_ctrl_c_keeps_what_was_best_and_proves_it(at: int) -> None:
 def test_ctrl_c_before_the_search_still_says_what_is_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     interrupt = interrupting(1)
 
-    def proved(*given: Any) -> Any:
+    def proved(*given: Any, budget: Budget) -> Any:
         interrupt()
-        return robust(*given)
+        return robust(*given, budget=budget)
 
     monkeypatch.setattr(designing, "robust", proved)
     found = for_box()
@@ -263,7 +263,7 @@ def test_matrices_that_are_uncertain_are_designed_for(pendulum: Pendulum, monkey
 def test_other_units_give_the_same_gains(texts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """States, measurements and z in other powers of two: every bit that the search goes through is as it was."""
     before = honest().before
-    monkeypatch.setattr(designing, "robust", lambda *_: before)  # proofs are those of the units that they are for
+    monkeypatch.setattr(designing, "robust", lambda *_, **__: before)  # proofs are those of the units that they are for
     x, y, document = np.array([2.0**9, 2.0**-7])[: nominal().problem.nx], 2.0**5, nominal().problem.document()
     plant, rows = nominal().problem.plant, x[:, None]
     document["plant"] |= {

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +19,16 @@ from agent.contract.arrays import Array
 from agent.contract.gains import Gains
 from agent.contract.problem import Problem
 from agent.contract.problem.matrices import Matrices
+from designer.box import worst as worst_of_a_box
 from designer.box.extent import Box, box_of, corners, truth_at, within
 from designer.box.radius import Shape, _Search, radii
-from designer.box.robust import Robust, robust
-from designer.box.worst import worst
+from designer.box.robust import Robust, proved_at, robust
+from designer.box.worst import _gain, worst
 from designer.cli import main
 from designer.gain.exact import exact_gain
 from designer.ladder import FOUND_IN_BOX, PROVED_IN_BOX, Ladder
 from designer.model.error_model import error_model, stacked_gains
+from designer.patience import Budget
 from designer.proof.ball_model import Truth
 from designer.proof.by_floats import ByFloats
 from designer.proof.by_vertices import ByVertices, prove, upper_bound
@@ -220,6 +223,42 @@ def one_node() -> Gains:
     )
     K, H = ({"m": {"a": {"a": np.array([[1.2]])}}} for _ in range(2))
     return uncertified(problem, K, H, method="made up")
+
+
+@pytest.mark.parametrize("name", ["all", "unbiased", "everything"])
+def test_where_time_is_over_what_was_found_is_proved(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gamma stays above every model, though neither the worst of them nor the best weights are looked for."""
+    found = case(name)
+    problem, K, H = found.gains.problem, found.gains.K, found.gains.H
+    looked, hurry = counted_gains(monkeypatch), Budget(0.0)
+    soon = robust(problem, K, H, found.box, budget=hurry)
+    assert len(looked) == 3  # the first model, and at the end it and the nominal one more closely
+    assert len(hurry.left_out) == 2
+    assert soon.gamma is not None
+    assert soon.found <= found.answer.found <= soon.gamma
+    again = proved_at(problem, K, H, found.box, soon.worst.truth, soon.gamma, soon.recipe)
+    assert again is not None
+    assert again.holds
+
+
+def test_where_there_is_time_nothing_is_left_out() -> None:
+    found, budget = case("all"), Budget(1e6)
+    assert (
+        robust(found.gains.problem, found.gains.K, found.gains.H, found.box, budget=budget).gamma == found.answer.gamma
+    )
+    assert not budget.left_out
+
+
+def counted_gains(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Those of constant models, as they are computed."""
+    looked: list[float] = []
+
+    def gain(*given: Any, **more: Any) -> float:
+        looked.append(_gain(*given, **more))
+        return looked[-1]
+
+    monkeypatch.setattr(worst_of_a_box, "_gain", gain)
+    return looked
 
 
 def test_an_unstable_model_in_the_box_has_no_gamma() -> None:
