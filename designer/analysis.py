@@ -79,6 +79,7 @@ class Analysis(NamedTuple):
     beyond: BeyondGamma | None = None  # noise, and each node by itself
     robust: Robust | None = None  # what is proved for every model of a box, if one was given
     radii: tuple[Radius, ...] = ()  # how large boxes may be, if that was asked
+    digits: int = 9  # of the rate that are known
 
     @property
     def foreign(self) -> bool:
@@ -137,7 +138,9 @@ class Analysis(NamedTuple):
         if not self._rate_is_credible:
             return "how fast in the long run, floats do not tell"
         rate = f"{self.radius:.{digits}g}" if math.isfinite(self.radius) else "more than a float64 holds"
-        if 0.0 < abs(self.radius - 1.0) < _NEAR_1:
+        if self.digits < digits and math.isfinite(self.radius):
+            rate = f"about {self.radius:.{self.digits}g}"
+        elif 0.0 < abs(self.radius - 1.0) < _NEAR_1:
             rate = f"1 {'-' if self.radius < 1.0 else '+'} {abs(1.0 - self.radius):.3g}"
         return f"computed: in the long run each step multiplies E|error|^2 by {rate}"
 
@@ -261,7 +264,8 @@ def analyse(
     ladder = Ladder(None if math.isinf(least) else least, exact, gamma=None, theorem2_exact=None, theorem2=None)
     if not gain.stable:
         stable = Prover(problem, given.K, given.H).stable.holds
-        return Analysis(problem, given, stable, gain.radius, gain.horizon, ladder, None, 0, None, None, None, 0, None)
+        none = ladder, None, 0, None, None, None, 0, None
+        return Analysis(problem, given, stable, gain.radius, gain.horizon, *none, digits=gain.digits)
     verdict = confirmed(problem, given.K, given.H, gain.high)
     if verdict.holds:
         ladder = ladder._replace(exact=(lower_end(problem, given.K, given.H, gain), verdict.gamma))
@@ -277,6 +281,7 @@ def analyse(
         given=given,
         stable=verdict.holds or Prover(problem, given.K, given.H).stable.holds,
         radius=gain.radius,
+        digits=gain.digits,
         horizon=gain.horizon,
         ladder=ladder._replace(
             gamma=verdict.gamma if verdict.holds else None,

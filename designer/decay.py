@@ -14,8 +14,10 @@ All that is found here is found in floats; what is claimed of it is proved in de
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property, partial
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +29,9 @@ Map = Callable[[Array], Array]
 _TERMS = 300  # that are added one by one, which rounds least; what decays more slowly is solved for
 DENSE = 1000  # unknowns up to which L is written out as a matrix
 _FEW = 40  # and up to which its eigenvalues take no time
-_ROUGH = 1e-4, 10  # tolerance and restarts of Arnoldi's method beyond twice as many: a product takes up to 0.1 s
+_TIGHT, _ROUGH = (1e-10, 60, 9), (1e-4, 10, 4)  # tolerance and restarts of Arnoldi's method, and digits then known
+_TIGHT_UP_TO = 50_000  # unknowns: beyond, 60 restarts take more than a second, as one product may take 0.1 s
+_DIGITS_OF_GROWTH = 2
 _TRANSIENT = 100.0  # growth before decay beyond this: eigenvalues react to rounding, and Arnoldi's method most of all
 _STEPS = 30  # in which it is looked for
 _HUGE = 1e150
@@ -39,16 +43,28 @@ _RANGE = 500.0  # of logarithms of weights
 _REST = 0.25  # what is left of U may be off by, measured by U
 
 
+class Rate(NamedTuple):
+    """The spectral radius of L, and how many of its digits are known."""
+
+    radius: float
+    digits: int = 9
+
+
 class Decay:
     """Z, (modes, n, n), with Z - L(Z) = rest > 0, or None where floats find none that surely has; and the radius."""
 
-    def __init__(self, total: Array | None, rest: Array | None, radius: Callable[[], float]) -> None:
-        self.total, self.rest, self._radius = total, rest, radius
+    def __init__(self, total: Array | None, rest: Array | None, rate: Callable[[], Rate]) -> None:
+        self.total, self.rest, self._rate = total, rest, rate
 
     @cached_property
+    def rate(self) -> Rate:
+        """Of L: of large networks it takes several times as long as Z, so only who asks pays for it."""
+        return self._rate()
+
+    @property
     def radius(self) -> float:
-        """Spectral radius of L: of large networks it takes several times as long as Z, so only who asks pays for it."""
-        return self._radius()
+        """Spectral radius of L."""
+        return self.rate.radius
 
     @property
     def dies_out(self) -> bool:
@@ -62,7 +78,7 @@ def decay(L: Map, modes: int, units: Array, moves: NDArray[np.bool_] | None = No
     `moves` (n, n): whether state j ever moves state i, as far as that is known; the radius is the better for it.
     """
     n, scaled = len(units), _in_units(L, units)
-    radius = partial(spectral_radius, scaled, modes, n, moves)
+    rate = partial(spectral_radius, scaled, modes, n, moves)
     total, rest = _total(scaled, modes, n)
     if n <= _BALANCED and (total is None or not np.abs(total).max() < _ROUNDED_AWAY):
         others = units * balance(scaled, modes, n)
@@ -70,7 +86,7 @@ def decay(L: Map, modes: int, units: Array, moves: NDArray[np.bool_] | None = No
         if again[0] is not None:
             units, (total, rest) = others, again
     both = np.outer(units, units)
-    return Decay(None if total is None else total * both, None if rest is None else rest * both, radius)
+    return Decay(None if total is None else total * both, None if rest is None else rest * both, rate)
 
 
 def _in_units(L: Map, units: Array) -> Map:
@@ -182,7 +198,7 @@ def solution(L: Map, right: Array, *, enough: float = _EXACT) -> Array | None:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None = None) -> float:
+def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None = None) -> Rate:
     """Of L; by its eigenvalues, of large ones by Arnoldi's method. Infinite where L overflows.
 
     Where states move each other in one direction only, as nodes in a line, eigenvalues of the whole are very sensitive
@@ -194,7 +210,7 @@ def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None 
 
     number, of_state = connected_components(moves, connection="strong")
 
-    def of_part(part: NDArray[np.intp]) -> float:
+    def of_part(part: NDArray[np.intp]) -> Rate:
         at = np.ix_(np.arange(modes), part, part)
 
         def within(Y: Array) -> Array:
@@ -204,31 +220,38 @@ def spectral_radius(L: Map, modes: int, n: int, moves: NDArray[np.bool_] | None 
 
         return _radius(within, modes, len(part))
 
-    return max(of_part(np.flatnonzero(of_state == k)) for k in range(number))
+    rates = [of_part(np.flatnonzero(of_state == k)) for k in range(number)]
+    return Rate(max(rate.radius for rate in rates), min(rate.digits for rate in rates))
 
 
-def _radius(L: Map, modes: int, n: int) -> float:
+def _radius(L: Map, modes: int, n: int) -> Rate:
     pack, unpack = packing(modes, n)
     order = modes * n * (n + 1) // 2
     first = pack(L(np.broadcast_to(np.eye(n), (modes, n, n))))
     if not np.isfinite(first).all():
-        return np.inf
-    if order > _FEW and find_spec("scipy"):
-        from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
-
-        operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
-        tol, restarts = (1e-10, 60) if order <= 2 * DENSE else _ROUGH
-        try:
-            found = eigs(operator, k=1, v0=first + 1e-30, tol=tol, maxiter=restarts, return_eigenvectors=False)
-            radius = float(np.abs(found).max())
-            if not _has_transient(L, modes, n, radius):
-                return radius
-        except ArpackError:
-            pass
+        return Rate(np.inf)
+    rate = _by_arnoldi(L, modes, n, first) if order > _FEW and find_spec("scipy") else None
+    if rate is not None and not _has_transient(L, modes, n, rate.radius):
+        return rate
     if order > 2 * DENSE:
-        return _rate(L, unpack(first))
+        return Rate(_growth(L, unpack(first)), _DIGITS_OF_GROWTH)
     M = _matrix(L, modes, n)
-    return float(np.abs(np.linalg.eigvals(M)).max()) if np.isfinite(M).all() else np.inf
+    return Rate(float(np.abs(np.linalg.eigvals(M)).max()) if np.isfinite(M).all() else np.inf)
+
+
+def _by_arnoldi(L: Map, modes: int, n: int, first: Array) -> Rate | None:
+    """From `first`, packed, as closely as a second allows; None where that finds nothing."""
+    from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
+
+    pack, unpack = packing(modes, n)
+    order = len(first)
+    operator = LinearOperator((order, order), matvec=lambda y: pack(L(unpack(y))), dtype=np.float64)
+    ways = [*([_TIGHT] if order <= _TIGHT_UP_TO else []), *([_ROUGH] if order > 2 * DENSE else [])]
+    for tol, restarts, digits in ways:
+        with suppress(ArpackError):
+            found = eigs(operator, k=1, v0=first + 1e-30, tol=tol, maxiter=restarts, return_eigenvectors=False)
+            return Rate(float(np.abs(found).max()), digits)
+    return None
 
 
 def _has_transient(L: Map, modes: int, n: int, radius: float) -> bool:
@@ -245,7 +268,7 @@ def _has_transient(L: Map, modes: int, n: int, radius: float) -> bool:
     return False
 
 
-def _rate(L: Map, Y: Array) -> float:
+def _growth(L: Map, Y: Array) -> float:
     """Growth per step over the second half of many, where nothing better is to be had."""
     logs = [0.0]
     for _ in range(_TERMS):

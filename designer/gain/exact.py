@@ -47,6 +47,12 @@ class Gain(NamedTuple):
     horizon: int
     P: Array | None  # (modes, n_eta, n_eta), satisfies (17) strictly; in its invariant set the recursion ends
     radius: float  # spectral radius of the operator L of `Operator.corner`: what E|eta|^2 is multiplied by, per step
+    digits: int = 9  # of it that are known
+
+    @property
+    def rate(self) -> str:
+        """The same for people."""
+        return f"{self.radius:.{min(self.digits, 6)}g}"
 
     @property
     def stable(self) -> bool:
@@ -267,11 +273,11 @@ def exact_gain(model: ErrorModel, *, width: float | None = None) -> Gain:
     invariant = invariant_set(operator, decays)
     if not invariant.P:
         low, _ = horizon_gain(operator, _UNSTABLE_HORIZON)
-        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, decays.radius)
+        return Gain(math.sqrt(low), math.inf, _UNSTABLE_HORIZON, None, *decays.rate)
     if width is None:
         width = _WIDTH if model.size < _LARGE else _WIDTH_OF_LARGE
     found = _bracket(operator, _MOST_STEPS, invariant, width)
-    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, invariant.P[0], decays.radius)
+    return Gain(math.sqrt(found.low), math.sqrt(found.high), found.horizon, invariant.P[0], *decays.rate)
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -372,7 +372,7 @@ class _Search:
             P, decays = lyapunov(operator)
             high = math.inf if P is None else least_gamma(operator.M, P) * (1.0 + _SHORT)
             found = Candidate(
-                *self.barrier.entries.unpack(v), Gain(0.0, high, 1, P, decays.radius), float(np.linalg.norm(v))
+                *self.barrier.entries.unpack(v), Gain(0.0, high, 1, P, *decays.rate), float(np.linalg.norm(v))
             )
             if P is not None:
                 break

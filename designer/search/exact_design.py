@@ -123,7 +123,7 @@ def design_exact(
     if not chosen.gain.stable:
         raise Unattainable(
             f"no mean-square stable gains were found for {problem.name}: the best ones multiply E|error|^2 by "
-            f"{chosen.gain.radius:.6g} in each step, as far as floats tell, and less than 1 is needed; "
+            f"{chosen.gain.rate} in each step, as far as floats tell, and less than 1 is needed; "
             f"{_advice(problem)}"
         )
     method, steps, status, stacked, gain = "exact", descent.steps, _status(descent, unit), chosen[:2], chosen.gain
@@ -354,7 +354,7 @@ def _near(problem: Problem, K: LinkMatrices, H: LinkMatrices, gain: Gain | None,
         known = Prover(problem, K, H).stable.holds
         are = "are not mean-square stable, which is proved" if known is False else "are not known to be stable"
         raise Unattainable(
-            f"the gains for {problem.name} {are}; as far as floats tell they multiply E|error|^2 by {gain.radius:.6g} "
+            f"the gains for {problem.name} {are}; as far as floats tell they multiply E|error|^2 by {gain.rate} "
             "in each step, and less than 1 is needed"
         )
     verdict = confirmed(problem, K, H, gain.high)

@@ -12,7 +12,7 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from designer import decay as module
 from designer.analysis import GivenGains, analyse
-from designer.decay import decay, spectral_radius
+from designer.decay import Rate, decay, spectral_radius
 from designer.gain.exact import Operator, exact_gain
 from designer.model.error_model import error_model, stacked_links
 from designer.proof.by_balls import ByBalls
@@ -149,7 +149,7 @@ def test_nor_is_a_long_one(own: float) -> None:
 
 def test_a_rate_that_is_proved_wrong_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
     for radius, says in ((0.9, 1.1), (1.1, 0.9)):
-        monkeypatch.setattr(module, "spectral_radius", lambda *given, says=says: says)
+        monkeypatch.setattr(module, "spectral_radius", lambda *given, says=says: Rate(says))
         problem, K, H = scalar(radius)
         H["t"]["n0"]["n0"][:] = 1e-6  # so that losses have a say
         analysis = analyse(problem, GivenGains(K, H, "by hand", None))
@@ -184,7 +184,7 @@ def test_the_radius_is_that_of_the_eigenvalues(large: bool, monkeypatch: pytest.
     case = chain([0.9, 0.3, -0.5, 0.7, 0.2])
     operator = operator_of(case)
     expected = float(np.abs(np.linalg.eigvals(module._matrix(operator.corner, 1, 5))).max())
-    assert spectral_radius(operator.corner, 1, 5) == pytest.approx(expected, rel=1e-9)
+    assert spectral_radius(operator.corner, 1, 5).radius == pytest.approx(expected, rel=1e-9)
     assert expected == pytest.approx(0.81, rel=1e-9)
 
 
@@ -198,11 +198,33 @@ def test_without_scipy_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[1] == pytest.approx(found[0], rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.parametrize(("seed", "tight_up_to", "digits"), [(0, module._TIGHT_UP_TO, 9), (0, 0, 4), (5, 0, 2)])
+def test_as_many_digits_are_known_as_are_said(
+    seed: int, tight_up_to: int, digits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Y to A'YA has 2485 unknowns, and the square of what A has; where it grows first, that is told least well."""
+    monkeypatch.setattr(module, "_TIGHT_UP_TO", tight_up_to)
+    A = np.random.default_rng(seed).normal(size=(70, 70))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+    rate = spectral_radius(lambda Y: A.T @ Y @ A, 1, 70)
+    assert rate.digits == digits
+    assert abs(rate.radius - 0.95**2) < 0.5 * 10.0**-digits
+
+
+@pytest.mark.parametrize(("digits", "says"), [(9, "by 0.823457"), (4, "by about 0.8235")])
+def test_no_more_digits_are_printed_than_are_known(digits: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "spectral_radius", lambda *given: Rate(0.823456789, digits))
+    problem, K, H = chain([0.9, 0.3])
+    next(iter(H.values()))["n0"]["n0"][0, 0] = 0.1  # chance has a say
+    told = analyse(problem, GivenGains(K, H, "by hand", None)).text()
+    assert f"multiplies E|error|^2 {says}\n" in told
+
+
 def test_the_radius_of_a_large_network_is_known_to_four_digits(monkeypatch: pytest.MonkeyPatch) -> None:
     operator = operator_of(chain([0.9, 0.3, -0.5, 0.7, 0.2]))
     monkeypatch.setattr(module, "_FEW", 0)
     monkeypatch.setattr(module, "DENSE", 0)
-    assert spectral_radius(operator.corner, 1, 5) == pytest.approx(0.81, rel=1e-3)
+    assert spectral_radius(operator.corner, 1, 5).radius == pytest.approx(0.81, rel=1e-3)
 
 
 @pytest.mark.parametrize("radius", [0.9, 0.9999, 1.001])
