@@ -149,7 +149,7 @@ class Budget:
 
         Where it is, `what` is left out. A signal does not end such a search.
         """
-        until = self.spent + share * max(self.left + self.kept, 0.0)
+        until = self.spent + share * max(self._left, 0.0)
 
         def over() -> bool:
             gone = self.spent >= until

@@ -110,8 +110,8 @@ def test_a_search_with_an_answer_before_its_end_gets_a_share_of_what_is_left() -
     budget, clock = budget_of(10.0)
     budget.keep(4.0)
     clock.now = 2.0
+    budget.asked, budget.over = 1, True  # to be proved, when no search comes any more
     half, all_of_it = budget.over_after(0.5, "half"), budget.over_after(1.0, "all")
-    budget.asked = 1
     clock.now = 5.9
     assert not half()
     clock.now = 6.1
