@@ -46,7 +46,7 @@ def again(gains: Gains, *, balls: bool = False) -> Robust | None:
     gain = gain_of(gains.problem, gains.K, gains.H, box, truth)
     worst = Worst(truth, gain, claim.ends, claim.rows, claim.signs)
     recipe = Recipe(claim.start, tuple(Round(*each) for each in claim.rounds))
-    verdict = proved_at(gains.problem, gains.K, gains.H, box, truth, claim.gamma, recipe, balls=balls)
+    verdict = proved_at(gains.problem, gains.K, gains.H, box, worst, claim.gamma, recipe, balls=balls)
     said = Robust(box, worst, verdict, recipe)
     if said.gamma is not None or not gain <= claim.gamma:
         return said

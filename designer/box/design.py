@@ -20,6 +20,7 @@ from agent.contract.errors import Unattainable, counted
 from agent.contract.gains import Gains, LinkMatrices
 from agent.contract.problem import Problem
 from designer.box.extent import Box
+from designer.box.natural import in_units
 from designer.box.robust import Robust, robust
 from designer.box.worst import real, worst
 from designer.coordinates import Coordinates
@@ -28,9 +29,8 @@ from designer.gain.sensitivity import Inputs
 from designer.gain.worst_case import with_worst_case
 from designer.ladder import Ladder, percent
 from designer.model.error_model import link_gains, stacked_links
-from designer.model.units import NaturalUnits, rounded
+from designer.model.units import NaturalUnits
 from designer.patience import Budget, TimeIsUp, looking
-from designer.proof.deviations import Entry
 from designer.search import bfgs
 from designer.search.barrier import Barrier
 from designer.search.descent import Progress, longest_horizon
@@ -155,7 +155,7 @@ class _Search:
     ) -> None:
         self.problem, self.box, self.budget, self.progress = problem, box, budget, progress
         self.natural = NaturalUnits(problem, None if box.entries else Coordinates.of(problem))
-        self.natural_box = box._replace(entries=tuple(_scaled(entry, self.natural) for entry in box.entries))
+        self.natural_box = in_units(box, self.natural)
         self.barrier = Barrier(self.natural.problem, _HORIZON, held=self.natural.held)
         self.longest = longest_horizon(problem)
         there = self.natural.there(start.K, start.H)
@@ -245,21 +245,3 @@ class _Search:
         if gamma < self.least:
             self.least, self.best = gamma, (K, H, found)
         return gamma
-
-
-def _scaled(entry: Entry, units: NaturalUnits) -> Entry:
-    """An entry of the same matrix in these units, rounded as the matrix is."""
-    r, c, x, y = entry.row, entry.column, units.state, units.y[entry.node]
-    match entry.matrix:
-        case "A":
-            by = x[c] / x[r]
-        case "B":
-            by = 1.0 / x[r]
-        case "M":
-            by = x[c] / units.output
-        case "C":
-            by = x[c] / y[r]
-        case _:
-            by = 1.0 / y[r]
-    radius = entry.radius * float(by)
-    return entry._replace(radius=radius if units.exactly else float(rounded(np.array(radius))))

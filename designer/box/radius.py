@@ -12,6 +12,7 @@ from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
 from agent.contract.problem.uncertainty import Tolerance
 from designer.box.extent import Box, box_of, corners, truth_at
+from designer.box.natural import Side, sides
 from designer.box.robust import models_of
 from designer.box.sought import ends, sought
 from designer.box.tail import invariant
@@ -108,7 +109,7 @@ def _radius(problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, ga
     low, high = search.coarse()
     if dear:
         low, high = search.further(low, high)
-    while low and not ((found := search.attempt(low)) and prove(found.by, problem.mode_names, gamma, found.P).holds):
+    while low and not search.proves(low):
         low, high = low - 1, low
     return Radius(shape, gamma, float(_size(low)), float(_size(high)) if high <= _PARTS else None)
 
@@ -128,9 +129,9 @@ class _Search:
     """The sizes of one shape that floats see an end of the recursion for, in parts."""
 
     def __init__(self, problem: Problem, K: LinkMatrices, H: LinkMatrices, shape: Shape, gamma: float) -> None:
-        self.problem, self.K, self.H, self.shape, self.gamma = problem, K, H, shape, gamma
-        largest = shape.box(problem, _LARGEST)
-        there, truth = there_of(problem, K, H, largest), told(problem)._replace(carry=largest.carry)
+        where, self.there = sides(problem, K, H, shape.box(problem, _LARGEST))
+        self.where, self.shape, self.given, self.gamma = where, shape, gamma, gamma / where.output
+        there, truth = there_of(*where[:4]), told(problem)._replace(carry=where.box.carry)
         self.nominal = model_of(there, truth)
         self.weights = weights_of(self.nominal, RAISED**2 - 1.0)
         self._worst: Worst | None = None
@@ -150,6 +151,19 @@ class _Search:
             low, high = high, min(high + max(1, high // 10), _PARTS) if high < _PARTS else _PARTS + 1
         return _halved(low, high, self.by_rounds)
 
+    def proves(self, parts: int) -> bool:
+        """Of the numbers that were given."""
+        found = self.attempt(parts)
+        if found is None:
+            return False
+        there = self.at(parts, self.there)
+        by, P = there.taken_from(self.where, *found)
+        return prove(by, there.problem.mode_names, self.given, P).holds
+
+    def at(self, parts: int, side: Side) -> Side:
+        """With the box of this size there."""
+        return side._replace(box=self.shape.box(side.problem, _size(parts)))
+
     def attempt(self, parts: int) -> Attempt | None:
         return self.plainly(parts) or self.by_rounds(parts)
 
@@ -157,9 +171,9 @@ class _Search:
         """With the weights of the nominal model; None: as far as floats tell gamma is not proved so."""
         if self.weights is None:
             return None
-        box = self.shape.box(self.problem, _size(parts))
-        T = there_of(self.problem, self.K, self.H, box).T
-        models = [Cube(self.problem, self.K, self.H, corner, box.entries, T) for corner in corners(self.problem, box)]
+        problem, K, H, box = self.at(parts, self.where)[:4]
+        T = there_of(problem, K, H, box).T
+        models = [Cube(problem, K, H, corner, box.entries, T) for corner in corners(problem, box)]
         tail = invariant(ByVertices(models, self.weights), Operator(self.nominal))
         if tail is None:
             return None
@@ -169,13 +183,14 @@ class _Search:
 
     def by_rounds(self, parts: int) -> Attempt | None:
         """With those that `designer.box.robust` finds; None as well where the model that is worst has more."""
-        box, gamma = self.shape.box(self.problem, _size(parts)), self.gamma
+        side, gamma = self.at(parts, self.where), self.gamma
+        problem, K, H, box = side[:4]
         if self._worst is None:  # other sizes are likely to have theirs in the same corner
-            self._worst = worst(self.problem, self.K, self.H, box)
+            self._worst = worst(problem, K, H, box)
         rows = [min(k, len(found) - 1) for k, found in zip(self._worst.rows, box.rows, strict=True)]
-        truth = truth_at(self.problem, box, self._worst.ends, rows, self._worst.signs)
-        models, likely = models_of(self.problem, self.K, self.H, box, truth)
-        if not gain_of(self.problem, self.K, self.H, box, truth) < gamma:
+        truth = truth_at(problem, box, self._worst.ends, rows, self._worst.signs)
+        models, likely = models_of(side, truth)
+        if not gain_of(problem, K, H, box, truth) < gamma:
             return None
         least = sought(models, likely, gamma**2, enough=gamma**2)
         return None if least is None or least.g > gamma**2 else Attempt(least.by, least.P)

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from agent.contract.errors import counted
 from agent.contract.gains import LinkMatrices
 from agent.contract.problem import Problem
-from designer.box.extent import Box, corners
+from designer.box.extent import Box, corners, truth_at
+from designer.box.natural import Side, sides
 from designer.box.sought import begun, sought
 from designer.box.weights import Recipe, moved
 from designer.box.worst import Worst, model_of, there_of, worst
@@ -104,25 +105,29 @@ def robust(
     `balls`: and proved once more in ball arithmetic. Where the `budget` is over, what was found by then is proved.
     """
     budget = Budget() if budget is None else budget
+    where, there = sides(problem, K, H, box)
     budget.goes_on("looking for the worst model of the box")
     over = budget.over_after(_SHARE_OF_WORST, "to look at more models of the box, for the worst")
-    found = worst(problem, K, H, box, over)
-    if not math.isfinite(found.gain):
+    near = worst(*where[:4], over)
+    truth = truth_at(problem, box, near.ends, near.rows, near.signs)
+    found = near._replace(truth=truth, gain=near.gain * where.output)
+    if not math.isfinite(near.gain):
         return Robust(box, found, None)
-    models, likely = models_of(problem, K, H, box, found.truth)
+    models, likely = models_of(where, near.truth)
     budget.goes_on("looking for the least gamma for every model of the box")
     over = budget.over_after(1.0, "a gamma for the box as low as floats find it")
-    least = sought(models, likely, found.gain**2, over=over)
+    least = sought(models, likely, near.gain**2, over=over)
     if least is None:
         return Robust(box, found, None)
     budget.goes_on("proving gamma for every model of the box")
+    by, P = there.taken_from(where, least.by, least.P)
     for more in _CLAIMED:
-        verdict = prove(least.by, problem.mode_names, math.sqrt(least.g) * (1.0 + more), least.P)
+        verdict = prove(by, problem.mode_names, math.sqrt(least.g) * where.output * (1.0 + more), P)
         if verdict.holds:
             break
-    gamma, recipe = verdict.gamma, least.recipe
+    recipe = least.recipe.times(where.output)
     if balls and verdict.holds:
-        return Robust(box, found, proved_at(problem, K, H, box, found.truth, gamma, recipe, balls=True), recipe)
+        return Robust(box, found, proved_at(problem, K, H, box, found, verdict.gamma, recipe, balls=True), recipe)
     return Robust(box, found, verdict, recipe)
 
 
@@ -131,7 +136,7 @@ def proved_at(
     K: LinkMatrices,
     H: LinkMatrices,
     box: Box,
-    truth: Truth,
+    near: Worst,
     gamma: float,
     recipe: Recipe,
     *,
@@ -139,28 +144,30 @@ def proved_at(
 ) -> Verdict | None:
     """Whether gamma holds for every model of the box, with the weights of the recipe; None: there are none.
 
-    `truth`: a model of the box in which the worst w is like the worst of all. `balls`: in ball arithmetic.
+    `near`: a model of the box in which the worst w is like the worst of all. `balls`: in ball arithmetic.
     """
-    models, likely = models_of(problem, K, H, box, truth)
+    where, there = sides(problem, K, H, box)
+    models, likely = models_of(where, truth_at(where.problem, where.box, near.ends, near.rows, near.signs))
     ends_by = next(islice(begun(models, likely), recipe.start, None), None)
     if ends_by is None:
         return None
     by, P = ends_by
-    for to in recipe.rounds:
+    for to in recipe.times(1.0 / where.output).rounds:
         weights = moved(by, Operator(likely[-1]).units, to)
         if weights is None:
             return None
         by = ByVertices(models, weights, by.mean)
+    by, P = there.taken_from(where, by, P)
     arithmetic: Arithmetic = by
     if balls:
-        arithmetic = VerticesByBalls(problem, K, H, [model.truth for model in models], box.entries, by, T=models[0].T)
+        T, every = by.corners[0].T, [model.truth for model in by.corners]
+        arithmetic = VerticesByBalls(there.problem, there.K, there.H, every, there.box.entries, by, T=T)
     return prove(arithmetic, problem.mode_names, gamma, P)
 
 
-def models_of(
-    problem: Problem, K: LinkMatrices, H: LinkMatrices, box: Box, truth: Truth
-) -> tuple[list[Cube], list[ErrorModel]]:
+def models_of(side: Side, truth: Truth) -> tuple[list[Cube], list[ErrorModel]]:
     """What stands at the corners, the likely worst first; and models whose worst w makes weights, the nominal last."""
+    problem, K, H, box = side[:4]
     every = sorted(corners(problem, box), key=lambda corner: _differs(corner, truth))
     there = there_of(problem, K, H, box)
     likely = [model_of(there, each) for each in (truth, told(problem)._replace(carry=box.carry))]

@@ -66,6 +66,10 @@ class Recipe(NamedTuple):
     start: int
     rounds: tuple[Round, ...]
 
+    def times(self, output: float) -> Recipe:
+        """For z in a unit of which this is so many."""
+        return self._replace(rounds=tuple(to._replace(gamma=to.gamma * output) for to in self.rounds))
+
 
 def moved(by: ByVertices, units: Array, to: Round) -> Array | None:
     """The weights of `by` after one round; None: the recursion does not come so far. `units` (n_eta,): of eta."""

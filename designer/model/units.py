@@ -218,8 +218,8 @@ def _closed(problem: Problem, K: LinkMatrices) -> LinkMatrices:
     A, closed = problem.plant.A, {}
     for topology in problem.topologies:
         closed[topology.name] = {name: dict(row) for name, row in K[topology.name].items()}
-        for row, weights, i in zip(closed[topology.name].values(), topology.adjacency, range(problem.n), strict=True):
-            own = problem.node_names[i]
+        for own, weights, i in zip(problem.node_names, topology.adjacency, range(problem.n), strict=True):
+            row = closed[topology.name][own]
             others = [weights[problem.node_names.index(j)] * K_ij for j, K_ij in row.items() if j != own]
             row[own] = (A - sum(others)) / weights[i]
     return closed

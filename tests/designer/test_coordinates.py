@@ -363,7 +363,7 @@ def test_a_box_of_probabilities_is_proved_where_M_cancels(
     assert found.gamma is not None
     assert gain.low < found.found < found.gamma < 1.1 * gain.high
     for gamma, holds in ((found.gamma, True), (gain.low, False)):
-        again = proved_at(problem, K, H, box, found.worst.truth, gamma, found.recipe, balls=True)
+        again = proved_at(problem, K, H, box, found.worst, gamma, found.recipe, balls=True)
         assert (again is not None and again.holds) is holds
 
 

@@ -135,6 +135,16 @@ def test_unbiased_gains_of_an_unstable_plant_are_the_same_in_any_units() -> None
     assert_same(designed("unbiased", "least-variance"), np.array([1e-6, 1e6]), 1e-3, 1e6, rtol=DECIMALS)
 
 
+def test_gains_of_a_file_are_the_same_in_whatever_order_it_names_nodes() -> None:
+    natural, gains = NaturalUnits(unbiased()), designed("unbiased")
+    K, H = ({s: dict(reversed(of_s.items())) for s, of_s in matrices.items()} for matrices in (gains.K, gains.H))
+    for turned, as_they_are in zip(natural.rounded_there(K, H), natural.rounded_there(gains.K, gains.H), strict=True):
+        for s, of_mode in as_they_are.items():
+            for i, heard in of_mode.items():
+                for j, G in heard.items():
+                    np.testing.assert_array_equal(turned[s][i][j], G)
+
+
 def test_numbers_that_are_not_rounded_are_not_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither with units that are powers of two, nor with the roundings of units left in: so the laws can fail."""
     problem = three_states()

@@ -263,7 +263,7 @@ def test_matrices_that_are_uncertain_are_designed_for(pendulum: Pendulum, monkey
 def test_other_units_give_the_same_gains(texts: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """States, measurements and z in other powers of two: every bit that the search goes through is as it was."""
     before = honest().before
-    monkeypatch.setattr(designing, "robust", lambda *_, **__: before)  # proofs are those of the units that they are for
+    monkeypatch.setattr(designing, "robust", lambda *_, **__: before)
     x, y, document = np.array([2.0**9, 2.0**-7])[: nominal().problem.nx], 2.0**5, nominal().problem.document()
     plant, rows = nominal().problem.plant, x[:, None]
     document["plant"] |= {

@@ -40,10 +40,10 @@ def test_forty_entries_of_six_nodes_are_proved_not_far_above_the_worst_that_is_f
     assert found.found <= found.gamma < 1.03 * found.found
     assert found.recipe.rounds
 
-    again = proved_at(gains.problem, gains.K, gains.H, box, found.worst.truth, found.gamma, found.recipe)
+    again = proved_at(gains.problem, gains.K, gains.H, box, found.worst, found.gamma, found.recipe)
     assert again is not None
     assert again.holds
-    without = proved_at(gains.problem, gains.K, gains.H, box, found.worst.truth, found.gamma, Recipe(0, ()))
+    without = proved_at(gains.problem, gains.K, gains.H, box, found.worst, found.gamma, Recipe(0, ()))
     assert without is not None
     assert not without.holds  # so it is the rounds that prove it
 

@@ -236,7 +236,7 @@ def test_where_time_is_over_what_was_found_is_proved(name: str, monkeypatch: pyt
     assert len(hurry.left_out) == 2
     assert soon.gamma is not None
     assert soon.found <= found.answer.found <= soon.gamma
-    again = proved_at(problem, K, H, found.box, soon.worst.truth, soon.gamma, soon.recipe)
+    again = proved_at(problem, K, H, found.box, soon.worst, soon.gamma, soon.recipe)
     assert again is not None
     assert again.holds
 
